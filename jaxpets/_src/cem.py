@@ -1,0 +1,116 @@
+"""The cross-entropy method over action sequences, as PETS uses it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_action_box, check_count, check_real
+from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+
+
+class CEMState(NamedTuple):
+    """The warm start: the mean of the next search."""
+
+    mean: Array  # [H, A]
+
+
+def cem(
+    *,
+    horizon: int,
+    action_low: Array,
+    action_high: Array,
+    num_samples: int = 500,
+    num_elites: int = 50,
+    num_iterations: int = 5,
+    momentum: float = 0.1,
+    min_variance: float = 1e-3,
+    legacy_variance: bool = False,
+) -> TrajectoryOptimizer:
+    """Builds the cross-entropy method with the settings of PETS.
+
+    Each iteration samples from a normal distribution cut off at two standard
+    deviations, which are narrowed so that no sample leaves the box, and moves mean and
+    variance towards those of the elites:
+    `new = momentum * old + (1 - momentum) * elite statistic`. The search returns the
+    final mean. The variance starts at `(high - low)^2 / 16` at every call; the mean is
+    the last solution shifted by one step and padded with the middle of the box.
+
+    Args:
+      horizon: H.
+      action_low: `[A]`.
+      action_high: `[A]`.
+      num_samples: N.
+      num_elites: how many of the best samples shape the next iteration.
+      num_iterations: iterations per call.
+      momentum: share of the old mean and variance that is kept.
+      min_variance: the search freezes once no variance exceeds this, in units of a
+        box scaled to `[-1, 1]`.
+      legacy_variance: take the elites' variance without momentum, as the first
+        public PETS code did by mistake until November 2018.
+
+    Returns:
+      A TrajectoryOptimizer.
+
+    Raises:
+      TypeError, ValueError: for a size, number or bound that cannot be searched with.
+
+    >>> import jax, jax.numpy as jnp
+    >>> one = jnp.ones(1)
+    >>> search = cem(horizon=3, action_low=-one, action_high=one)
+    >>> objective = lambda key, actions: -jnp.sum((actions - 0.5) ** 2, (1, 2))
+    >>> solution, _ = search.step(objective, jax.random.key(0), search.init())
+    >>> bool(jnp.all(jnp.abs(solution.actions - 0.5) < 0.05))
+    True
+    """
+    check_count("horizon", horizon)
+    check_action_box(action_low, action_high)
+    check_count("num_elites", num_elites, minimum=2)
+    check_count("num_samples", num_samples, minimum=num_elites)
+    check_count("num_iterations", num_iterations)
+    check_real("momentum", momentum, 0.0, 1.0)
+    check_real("min_variance", min_variance, 0.0)
+    center = (action_low + action_high) / 2
+    half_width = (action_high - action_low) / 2
+    shape = (horizon, center.shape[0])
+
+    def sample(key: Array, mean: Array, variance: Array) -> Array:
+        margin = jnp.minimum(mean - action_low, action_high - mean)
+        std = jnp.minimum(jnp.sqrt(variance), margin / 2)
+        noise = jax.random.truncated_normal(key, -2.0, 2.0, (num_samples, *shape))
+        # The clip only removes rounding: mean + 2 * std can pass the bound by one ulp.
+        return jnp.clip(mean + std * noise, action_low, action_high)
+
+    def init() -> CEMState:
+        return CEMState(mean=jnp.broadcast_to(center, shape))
+
+    def step(
+        objective_fn: ObjectiveFn, key: Array, state: CEMState
+    ) -> tuple[Solution, CEMState]:
+        def iterate(carry: tuple, key: Array) -> tuple[tuple, None]:
+            mean, variance, _value = carry
+            sample_key, value_key = jax.random.split(key)
+            actions = sample(sample_key, mean, variance)
+            values = objective_fn(value_key, actions)
+            elite_values, elite_index = jax.lax.top_k(values, num_elites)
+            elites = actions[elite_index]
+            kept = 0.0 if legacy_variance else momentum
+            new = (
+                momentum * mean + (1 - momentum) * elites.mean(0),
+                kept * variance + (1 - kept) * elites.var(0),
+                elite_values.mean(),
+            )
+            searching = jnp.max(variance / half_width**2) > min_variance
+            return jax.tree.map(
+                lambda a, b: jnp.where(searching, a, b), new, carry
+            ), None
+
+        variance = jnp.broadcast_to(half_width**2 / 4, shape)
+        start = (state.mean, variance, jnp.zeros((), jnp.float32))
+        keys = jax.random.split(key, num_iterations)
+        (mean, _, value), _ = jax.lax.scan(iterate, start, keys)
+        shifted = jnp.concatenate([mean[1:], center[None]])
+        return Solution(actions=mean, value=value), CEMState(mean=shifted)
+
+    return TrajectoryOptimizer(init, step)

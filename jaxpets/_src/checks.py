@@ -1,0 +1,84 @@
+"""Checks at the public boundary: what is wrong is said when a thing is built or traced.
+
+Every message names the argument, what was wanted and what came.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+
+def check_count(name: str, value: Any, minimum: int = 1) -> None:
+    """Raises unless `value` is a Python integer of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be a Python int, got {value!r} ({kind}).")
+    if value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {value}.")
+
+
+def check_real(name: str, value: Any, low: float, high: float = math.inf) -> None:
+    """Raises unless `value` is a finite Python number in `[low, high]`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)):
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be a Python float, got {value!r} ({kind}).")
+    if not (math.isfinite(value) and low <= value <= high):
+        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value!r}.")
+
+
+def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> None:
+    """Raises unless `value` is a float32 array of `shape`.
+
+    Entries of `shape` that are None or a letter match any size; a leading "..."
+    matches any number of axes.
+    """
+    got = jnp.shape(value)
+    wanted = tuple(shape)
+    tail = wanted
+    if wanted and wanted[0] == "...":
+        tail = wanted[1:]
+        got_tail = got[len(got) - len(tail) :] if len(got) >= len(tail) else None
+    else:
+        got_tail = got if len(got) == len(tail) else None
+    fits = got_tail is not None and all(
+        want == size for want, size in zip(tail, got_tail, strict=True)
+        if isinstance(want, int)
+    )  # fmt: skip
+    dtype = jnp.result_type(value)
+    if not fits or dtype != jnp.float32:
+        text = ", ".join("?" if want is None else str(want) for want in wanted)
+        raise ValueError(f"{name} must be float32[{text}], got {dtype}{list(got)}.")
+
+
+def check_action_box(action_low: Array, action_high: Array) -> None:
+    """Raises unless the two are `[A]`, finite and `low < high` in every entry."""
+    check_array("action_low", action_low, ["A"])
+    check_array("action_high", action_high, [jnp.shape(action_low)[0]])
+    bounds = (action_low, action_high)
+    if any(isinstance(bound, jax.core.Tracer) for bound in bounds):
+        return
+    low, high = np.asarray(action_low), np.asarray(action_high)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        raise ValueError(
+            "action_low and action_high must be finite with low < high, "
+            f"got {low.tolist()} and {high.tolist()}."
+        )
+
+
+def check_key(name: str, key: Any) -> None:
+    """Raises unless `key` is one typed key, as `jax.random.key` makes it."""
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        raise TypeError(
+            f"{name} must be a typed key from jax.random.key, got {dtype or key!r}."
+        )
+    if key.shape != ():
+        raise ValueError(
+            f"{name} must be a single key, got a batch of shape {key.shape}; "
+            "use jax.vmap to map over keys."
+        )

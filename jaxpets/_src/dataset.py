@@ -1,0 +1,57 @@
+"""A dataset of fixed capacity, so that it grows without a retrace."""
+
+import jax.numpy as jnp
+
+from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.types import Dataset, Transition
+
+
+def init_dataset(capacity: int, obs_size: int, action_size: int) -> Dataset:
+    """Returns an empty dataset for C = `capacity` transitions.
+
+    Args:
+      capacity: C.
+      obs_size: D.
+      action_size: A.
+
+    Raises:
+      TypeError, ValueError: unless all are positive Python integers.
+    """
+    check_count("capacity", capacity)
+    check_count("obs_size", obs_size)
+    check_count("action_size", action_size)
+    obs = jnp.zeros((capacity, obs_size), jnp.float32)
+    action = jnp.zeros((capacity, action_size), jnp.float32)
+    empty = jnp.zeros((), jnp.int32)
+    return Dataset(Transition(obs, action, obs), empty, empty)
+
+
+def append(dataset: Dataset, transitions: Transition) -> Dataset:
+    """Returns the dataset with T more rows, the oldest replaced once it is full.
+
+    Args:
+      dataset: what there is.
+      transitions: `[T, D]`, `[T, A]`, `[T, D]`, T at most the capacity.
+
+    Raises:
+      ValueError: if a width, a length or a dtype does not fit.
+    """
+    capacity, obs_size = dataset.data.obs.shape
+    length = transitions.obs.shape[0]
+    if length > capacity:
+        raise ValueError(
+            f"transitions must fit the capacity of {capacity}, got {length} rows."
+        )
+    check_array("transitions.obs", transitions.obs, [length, obs_size])
+    check_array("transitions.next_obs", transitions.next_obs, [length, obs_size])
+    action_size = dataset.data.action.shape[1]
+    check_array("transitions.action", transitions.action, [length, action_size])
+    rows = (dataset.cursor + jnp.arange(length, dtype=jnp.int32)) % capacity
+    data = Transition(
+        *(
+            old.at[rows].set(new)
+            for old, new in zip(dataset.data, transitions, strict=True)
+        )
+    )
+    size = jnp.minimum(dataset.size + length, capacity)
+    return Dataset(data, size, (dataset.cursor + length) % capacity)

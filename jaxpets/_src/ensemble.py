@@ -1,0 +1,291 @@
+"""The probabilistic ensemble of PETS: Gaussian networks that share variance bounds."""
+
+import dataclasses
+import enum
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_array, check_count, check_real
+from jaxpets._src.moments import moments
+from jaxpets._src.types import DynamicsFn, ModelSpace, Transition
+
+
+class Precision(enum.Enum):
+    """How the matrix products of the network are computed; sums are always float32."""
+
+    F32 = "f32"
+    TF32 = "tf32"  # float32 where the hardware has no TF32
+    BF16 = "bf16"
+
+
+@dataclasses.dataclass(frozen=True)
+class EnsembleConfig:
+    """The network and loss of PETS on HalfCheetah.
+
+    Attributes:
+      num_members: E.
+      hidden_sizes: widths of the hidden layers.
+      weight_decays: one per layer, the output layer last; each times `sum(w^2) / 2`.
+      bound_decay: pull of the loss on the log-variance bounds.
+      precision: of the matrix products. It changes no parameter, so an ensemble may be
+        trained in one precision and planned with in another.
+      state_margin: imagined states may leave the range of the data by this share of
+        its width; None leaves them free. Not in PETS: without it a learned model can
+        blow up while every number stays finite, and a planner that looks for
+        disagreement finds that.
+    """
+
+    num_members: int = 5
+    hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
+    weight_decays: tuple[float, ...] = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4)
+    bound_decay: float = 0.01
+    precision: Precision = Precision.TF32
+    state_margin: float | None = 0.5
+
+    def __post_init__(self) -> None:
+        check_count("num_members", self.num_members)
+        for size in self.hidden_sizes:
+            check_count("hidden_sizes", size)
+        if len(self.weight_decays) != len(self.hidden_sizes) + 1:
+            raise ValueError(
+                "weight_decays must have one entry per layer "
+                f"({len(self.hidden_sizes) + 1}), got {len(self.weight_decays)}."
+            )
+        for decay in self.weight_decays:
+            check_real("weight_decays", decay, 0.0)
+        check_real("bound_decay", self.bound_decay, 0.0)
+        if not isinstance(self.precision, Precision):
+            raise TypeError(f"precision must be a Precision, got {self.precision!r}.")
+        if self.state_margin is not None:
+            check_real("state_margin", self.state_margin, 0.0)
+
+
+class NetworkParams(NamedTuple):
+    """What gradients train."""
+
+    members: Any  # flax parameters; every leaf starts with E
+    min_logvar: Array  # [D], shared by the members
+    max_logvar: Array  # [D], shared by the members
+
+
+class Scaler(NamedTuple):
+    """What the data say about scale, shared by the members."""
+
+    mean: Array  # [F + A] of features and action
+    std: Array  # [F + A]
+    low: Array  # [D] smallest observation
+    high: Array  # [D] largest observation
+
+
+class EnsembleParams(NamedTuple):
+    """A model: everything that predicting needs."""
+
+    network: NetworkParams
+    scaler: Scaler
+
+
+class Ensemble(NamedTuple):
+    """Pure functions of one ensemble.
+
+    init: `(key) -> EnsembleParams`.
+    predict: `(params, obs [E, B, D], action [B, A]) -> (mean, variance)`, both
+      `[E, B, D]`, of the next observation.
+    sample: a DynamicsFn; draws from `predict` and bounds the result.
+    fit_scaler: `(data: Transition [C, ...], size []) -> Scaler` over the first rows.
+    encode: `(scaler, data: Transition) -> (inputs [..., F+A], targets [..., D])`.
+    loss: `(network, inputs [E, B, F+A], targets [E, B, D], weight [B]) -> (loss, mse)`;
+      `weight` sums to one.
+    project: `(network) -> network` with variance bounds in order.
+    """
+
+    init: Callable[[Array], EnsembleParams]
+    predict: Callable[[EnsembleParams, Array, Array], tuple[Array, Array]]
+    sample: DynamicsFn
+    fit_scaler: Callable[[Transition, Array], Scaler]
+    encode: Callable[[Scaler, Transition], tuple[Array, Array]]
+    loss: Callable[[NetworkParams, Array, Array, Array], tuple[Array, Array]]
+    project: Callable[[NetworkParams], NetworkParams]
+
+
+# The bounds may not cross: past that point nothing holds max_logvar, which is the
+# denominator of the exploration reward, and Adam would lower it for ever.
+_MIN_BOUND_GAP = 0.1
+
+
+def delta_space() -> ModelSpace:
+    """Returns the plain space: features are the observation, targets its change.
+
+    >>> space = delta_space()
+    >>> obs, next_obs = jnp.zeros(3), jnp.ones(3)
+    >>> space.next_obs(obs, space.target(obs, next_obs)).tolist()
+    [1.0, 1.0, 1.0]
+    """
+    return ModelSpace(
+        features=lambda obs: obs,
+        target=lambda obs, next_obs: next_obs - obs,
+        next_obs=lambda obs, target: obs + target,
+        bound=jnp.clip,
+    )
+
+
+def max_variance(params: EnsembleParams) -> Array:
+    """Returns `exp(max_logvar)` `[D]` in units of obs squared: the paper's w_base."""
+    return jnp.exp(params.network.max_logvar)
+
+
+def ensemble(
+    config: EnsembleConfig, space: ModelSpace, *, obs_size: int, action_size: int
+) -> Ensemble:
+    """Builds the ensemble of section 3.2: E Gaussian networks trained side by side.
+
+    A member reads standardised features and action and returns a mean and a raw
+    log-variance, bounded softly by learned vectors that all members share:
+    `lv = max - softplus(max - raw)`, then `lv = min + softplus(lv - min)`.
+
+    The loss is that of PETS: the sum over members of the mean over rows and
+    dimensions of `(mean - y)^2 exp(-lv) + lv`, plus weight decay, plus
+    `bound_decay * (sum(max_logvar) - sum(min_logvar))`.
+
+    Args:
+      config: sizes and coefficients.
+      space: coordinates.
+      obs_size: D.
+      action_size: A.
+
+    Returns:
+      An Ensemble.
+
+    Raises:
+      TypeError, ValueError: when sizes do not fit; from the functions at trace time.
+    """
+    check_count("obs_size", obs_size)
+    check_count("action_size", action_size)
+    feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
+    input_size = feature_size + action_size
+    network = _Network(config.hidden_sizes, 2 * obs_size, config.precision)
+    apply_members = jax.vmap(network.apply)
+
+    def init(key: Array) -> EnsembleParams:
+        keys = jax.random.split(key, config.num_members)
+        example = jnp.zeros((1, input_size), jnp.float32)
+        members = jax.vmap(network.init, (0, None))(keys, example)
+        zeros = jnp.zeros((obs_size,), jnp.float32)
+        inputs = jnp.zeros((input_size,), jnp.float32)
+        scaler = Scaler(inputs, inputs + 1.0, zeros - jnp.inf, zeros + jnp.inf)
+        return EnsembleParams(NetworkParams(members, zeros - 10.0, zeros + 0.5), scaler)
+
+    def forward(network: NetworkParams, inputs: Array) -> tuple[Array, Array]:
+        mean, raw = jnp.split(apply_members(network.members, inputs), 2, axis=-1)
+        low, high = network.min_logvar, network.max_logvar
+        logvar = high - jax.nn.softplus(high - raw)
+        return mean, low + jax.nn.softplus(logvar - low)
+
+    def encode_inputs(scaler: Scaler, obs: Array, action: Array) -> Array:
+        inputs = jnp.concatenate([space.features(obs), action], axis=-1)
+        return (inputs - scaler.mean) / scaler.std
+
+    def encode(scaler: Scaler, data: Transition) -> tuple[Array, Array]:
+        inputs = encode_inputs(scaler, data.obs, data.action)
+        return inputs, space.target(data.obs, data.next_obs)
+
+    def distribution(
+        params: EnsembleParams, obs: Array, action: Array
+    ) -> tuple[Array, Array]:
+        check_array("obs", obs, [config.num_members, "B", obs_size])
+        check_array("action", action, [obs.shape[1], action_size])
+        actions = jnp.broadcast_to(action, (config.num_members, *action.shape))
+        return forward(params.network, encode_inputs(params.scaler, obs, actions))
+
+    def predict(
+        params: EnsembleParams, obs: Array, action: Array
+    ) -> tuple[Array, Array]:
+        mean, logvar = distribution(params, obs, action)
+        return space.next_obs(obs, mean), jnp.exp(logvar)
+
+    def sample(params: EnsembleParams, key: Array, obs: Array, action: Array) -> Array:
+        mean, logvar = distribution(params, obs, action)
+        noise = jax.random.normal(key, mean.shape, jnp.float32)
+        next_obs = space.next_obs(obs, mean + jnp.exp(logvar / 2) * noise)
+        if config.state_margin is None:
+            return next_obs
+        low, high = params.scaler.low, params.scaler.high
+        # Before any data the range is infinite, and so must its margin be.
+        margin = config.state_margin * (high - low)
+        return space.bound(next_obs, low - margin, high + margin)
+
+    def fit_scaler(data: Transition, size: Array) -> Scaler:
+        inputs = jnp.concatenate([space.features(data.obs), data.action], axis=-1)
+        mean, std = moments(inputs, size)
+        used = (jnp.arange(inputs.shape[0]) < size)[:, None]
+        obs = jnp.stack([data.obs, data.next_obs])
+        low = jnp.min(jnp.where(used, obs, jnp.inf), axis=(0, 1))
+        high = jnp.max(jnp.where(used, obs, -jnp.inf), axis=(0, 1))
+        # Without data there is no range to keep to.
+        low = jnp.where(size > 0, low, -jnp.inf)
+        return Scaler(mean, std, low, jnp.where(size > 0, high, jnp.inf))
+
+    def loss(
+        network: NetworkParams, inputs: Array, targets: Array, weight: Array
+    ) -> tuple[Array, Array]:
+        mean, logvar = forward(network, inputs)
+        square = (mean - targets) ** 2
+        rows = jnp.mean(square * jnp.exp(-logvar) + logvar, axis=-1)
+        decay = sum(
+            rate * jnp.sum(network.members["params"][f"layer_{i}"]["kernel"] ** 2) / 2
+            for i, rate in enumerate(config.weight_decays)
+        )
+        gap = jnp.sum(network.max_logvar) - jnp.sum(network.min_logvar)
+        total = jnp.sum(rows * weight) + decay + config.bound_decay * gap
+        mse = jnp.sum(jnp.mean(square, axis=(0, 2)) * weight)
+        return total, mse
+
+    def project(network: NetworkParams) -> NetworkParams:
+        floor = network.min_logvar + _MIN_BOUND_GAP
+        return network._replace(max_logvar=jnp.maximum(network.max_logvar, floor))
+
+    return Ensemble(init, predict, sample, fit_scaler, encode, loss, project)
+
+
+class _Network(nn.Module):
+    """One member: swish layers and a linear output of means and raw log-variances."""
+
+    hidden_sizes: tuple[int, ...]
+    output_size: int
+    precision: Precision
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for i, size in enumerate(self.hidden_sizes):
+            x = nn.swish(self._dense(i, size, x))
+        return self._dense(len(self.hidden_sizes), self.output_size, x)
+
+    def _dense(self, index: int, size: int, x: Array) -> Array:
+        # PETS: normal cut at two deviations, std = 1 / (2 sqrt(fan_in)); zero biases.
+        init = nn.initializers.truncated_normal(1.0 / (2.0 * x.shape[-1] ** 0.5))
+        product = functools.partial(_dot_general, self.precision)
+        layer = nn.Dense(
+            size, kernel_init=init, dot_general=product, name=f"layer_{index}"
+        )
+        return layer(x)
+
+
+def _dot_general(
+    wanted: Precision, lhs: Array, rhs: Array, dimension_numbers: Any, **_: Any
+) -> Array:
+    """`lax.dot_general` in the wanted precision, with a float32 result."""
+    if wanted is Precision.BF16:
+        lhs, rhs = lhs.astype(jnp.bfloat16), rhs.astype(jnp.bfloat16)
+    exact = jax.lax.Precision.HIGHEST if wanted is Precision.F32 else None
+    return jax.lax.dot_general(
+        lhs,
+        rhs,
+        dimension_numbers,
+        precision=exact,
+        preferred_element_type=jnp.float32,
+    )

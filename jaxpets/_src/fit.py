@@ -1,0 +1,158 @@
+"""Training of the ensemble: bootstraps, epochs and minibatches in one program."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from jaxpets._src.checks import check_count, check_key
+from jaxpets._src.ensemble import Ensemble, EnsembleParams, NetworkParams
+from jaxpets._src.types import Dataset
+
+
+@dataclasses.dataclass(frozen=True)
+class FitConfig:
+    """How often and in what portions the data are shown; the defaults are PETS's.
+
+    Attributes:
+      num_epochs: passes over the data per call.
+      batch_size: rows per member and gradient step.
+    """
+
+    num_epochs: int = 5
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        check_count("num_epochs", self.num_epochs)
+        check_count("batch_size", self.batch_size)
+
+
+class FitState(NamedTuple):
+    """What the optimizer keeps between calls: the warm start of training."""
+
+    opt_state: Any
+
+
+class FitMetrics(NamedTuple):
+    """How the last call went."""
+
+    loss: Array  # [] mean over the last epoch
+    mse: Array  # [] mean squared error of the mean, over members and dimensions
+    num_updates: Array  # [] int32
+    num_skipped: Array  # [] int32, updates dropped because the loss was not finite
+
+
+class Fitter(NamedTuple):
+    """Training as a pure function.
+
+    init: `(EnsembleParams) -> FitState`.
+    step: `(params, key, state, dataset) -> (params, state, FitMetrics)`.
+    """
+
+    init: Callable[[EnsembleParams], FitState]
+    step: Callable[
+        [EnsembleParams, Array, FitState, Dataset],
+        tuple[EnsembleParams, FitState, FitMetrics],
+    ]
+
+
+def fit(
+    ensemble: Ensemble, optimizer: optax.GradientTransformation, config: FitConfig
+) -> Fitter:
+    """Builds the trainer of PETS.
+
+    One call refits the scaler on all data, draws a bootstrap per member (as many rows
+    as there are, with replacement; section 3.2), and runs `num_epochs` epochs over it,
+    shuffled anew for each member and epoch. Networks and optimizer go on from where
+    the last call left them. The number of updates follows the data, so a growing
+    dataset needs no retrace; the last batch of an epoch is masked to what is left.
+
+    An update whose loss is not finite is dropped and counted. After every update the
+    variance bounds are put in order, see `Ensemble.project`.
+
+    Args:
+      ensemble: what to train.
+      optimizer: for example `optax.adam(1e-3)`.
+      config: epochs and batch size.
+
+    Returns:
+      A Fitter.
+    """
+    batch_size = config.batch_size
+
+    def init(params: EnsembleParams) -> FitState:
+        return FitState(optimizer.init(params.network))
+
+    def update(
+        network: NetworkParams, opt_state: Any, inputs: Array, targets: Array,
+        weight: Array,
+    ) -> tuple[NetworkParams, Any, Array, Array]:  # fmt: skip
+        grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
+        (loss, mse), grads = grad_fn(network, inputs, targets, weight)
+        # Optimizers of optax do not trace under strict promotion, if a caller set it.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, new_state = optimizer.update(grads, opt_state, network)
+        new = ensemble.project(optax.apply_updates(network, updates))
+        finite = jnp.isfinite(loss)
+        network, opt_state = jax.tree.map(
+            lambda a, b: jnp.where(finite, a, b), (new, new_state), (network, opt_state)
+        )
+        return network, opt_state, loss, mse
+
+    def step(
+        params: EnsembleParams, key: Array, state: FitState, dataset: Dataset
+    ) -> tuple[EnsembleParams, FitState, FitMetrics]:
+        check_key("key", key)
+        size = dataset.size
+        scaler = ensemble.fit_scaler(dataset.data, size)
+        inputs, targets = ensemble.encode(scaler, dataset.data)
+        num_members = jax.tree.leaves(params.network.members)[0].shape[0]
+        shape = (num_members, inputs.shape[0])
+        bootstrap_key, epochs_key = jax.random.split(key)
+        bootstrap = jax.random.randint(bootstrap_key, shape, 0, jnp.maximum(size, 1))
+        num_batches = (size + batch_size - 1) // batch_size
+
+        def epoch(carry: tuple, key: Array) -> tuple[tuple, None]:
+            network, opt_state, skipped, _ = carry
+            order = jax.random.uniform(key, shape, jnp.float32)
+            order = jnp.where(jnp.arange(shape[1]) < size, order, jnp.inf)
+            rows = jnp.take_along_axis(bootstrap, jnp.argsort(order, axis=1), axis=1)
+
+            def batch(i: Array, carry: tuple) -> tuple:
+                network, opt_state, skipped, totals = carry
+                position = i * batch_size + jnp.arange(batch_size, dtype=jnp.int32)
+                picked = jnp.take(rows, position, axis=1, mode="clip")
+                used = (position < size).astype(jnp.float32)
+                count = jnp.sum(used)
+                network, opt_state, loss, mse = update(
+                    network, opt_state, inputs[picked], targets[picked], used / count
+                )
+                bad = jnp.logical_not(jnp.isfinite(loss))
+                share = count / size.astype(jnp.float32)
+                totals = jax.tree.map(
+                    lambda t, x: t + jnp.where(bad, 0.0, x) * share, totals, (loss, mse)
+                )
+                return network, opt_state, skipped + bad.astype(jnp.int32), totals
+
+            zero = jnp.zeros((), jnp.float32)
+            carry = (network, opt_state, skipped, (zero, zero))
+            return jax.lax.fori_loop(0, num_batches, batch, carry), None
+
+        zero = jnp.zeros((), jnp.float32)
+        carry = (
+            params.network,
+            state.opt_state,
+            jnp.zeros((), jnp.int32),
+            (zero, zero),
+        )
+        keys = jax.random.split(epochs_key, config.num_epochs)
+        (network, opt_state, skipped, (loss, mse)), _ = jax.lax.scan(epoch, carry, keys)
+        num_updates = (num_batches * config.num_epochs).astype(jnp.int32)
+        metrics = FitMetrics(loss, mse, num_updates, skipped)
+        return EnsembleParams(network, scaler), FitState(opt_state), metrics
+
+    return Fitter(init, step)

@@ -1,0 +1,156 @@
+"""iCEM: a cross-entropy method for small budgets."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_action_box, check_count, check_real
+from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+
+
+class ICEMState(NamedTuple):
+    """The warm start: the mean and the best sequences of the last search."""
+
+    mean: Array  # [H, A]
+    elites: Array  # [K, H, A], K sequences kept
+
+
+def icem(
+    *,
+    horizon: int,
+    action_low: Array,
+    action_high: Array,
+    num_samples: int = 64,
+    num_elites: int = 10,
+    num_iterations: int = 3,
+    momentum: float = 0.1,
+    noise_beta: float = 2.0,
+    init_std: float = 0.5,
+    kept_fraction: float = 0.3,
+    decay: float = 1.25,
+    execute_best: bool = False,
+) -> TrajectoryOptimizer:
+    """Builds iCEM (Pinneri et al., 2020).
+
+    Against `cem`: noise is correlated over time, with power `1 / f^noise_beta`; a share
+    of the elites enters the next iteration and, shifted by one step, the next call;
+    iteration i draws `num_samples / decay^i` samples, never fewer than two times
+    the elites; the last iteration also tries the mean itself.
+
+    Args:
+      horizon: H.
+      action_low: `[A]`.
+      action_high: `[A]`.
+      num_samples: N of the first iteration.
+      num_elites: how many of the best samples shape the next iteration.
+      num_iterations: iterations per call.
+      momentum: share of the old mean and standard deviation that is kept.
+      noise_beta: 0 is white noise, 2 a random walk.
+      init_std: standard deviation at the start of a call, in units of a box scaled to
+        `[-1, 1]`.
+      kept_fraction: share of the elites that is kept.
+      decay: shrinking factor of the population.
+      execute_best: return the best sequence seen in the last iteration, as in the
+        paper of iCEM, and not the mean, which is less prone to a model's errors.
+
+    Returns:
+      A TrajectoryOptimizer.
+
+    Raises:
+      TypeError, ValueError: for a size, number or bound that cannot be searched with.
+    """
+    check_count("horizon", horizon)
+    check_action_box(action_low, action_high)
+    check_count("num_elites", num_elites, minimum=2)
+    check_count("num_samples", num_samples, minimum=num_elites)
+    check_count("num_iterations", num_iterations)
+    check_real("momentum", momentum, 0.0, 1.0)
+    check_real("noise_beta", noise_beta, 0.0)
+    check_real("init_std", init_std, 1e-6)
+    check_real("kept_fraction", kept_fraction, 0.0, 1.0)
+    check_real("decay", decay, 1.0)
+    center = (action_low + action_high) / 2
+    half_width = (action_high - action_low) / 2
+    shape = (horizon, center.shape[0])
+    num_kept = round(kept_fraction * num_elites)
+    smallest = min(num_samples, 2 * num_elites)
+    populations = [
+        max(int(num_samples / decay**i), smallest) for i in range(num_iterations)
+    ]
+
+    def init() -> ICEMState:
+        mean = jnp.broadcast_to(center, shape)
+        # No sequence was found yet: the middle of the box stands in.
+        return ICEMState(mean, jnp.broadcast_to(mean, (num_kept, *shape)))
+
+    def step(
+        objective_fn: ObjectiveFn, key: Array, state: ICEMState
+    ) -> tuple[Solution, ICEMState]:
+        mean, kept = state
+        std = jnp.broadcast_to(init_std * half_width, shape)
+        keys = jax.random.split(key, num_iterations)
+        best = value = None
+        # A Python loop, because the population, a shape, shrinks.
+        for i, population in enumerate(populations):
+            sample_key, value_key = jax.random.split(keys[i])
+            noise = colored_noise(sample_key, noise_beta, (population, *shape))
+            actions = jnp.clip(mean + std * noise, action_low, action_high)
+            candidates = [actions, kept]
+            if i == num_iterations - 1:
+                candidates.append(mean[None])
+            actions = jnp.concatenate(candidates)
+            values = objective_fn(value_key, actions)
+            elite_values, elite_index = jax.lax.top_k(values, num_elites)
+            elites = actions[elite_index]
+            mean = momentum * mean + (1 - momentum) * elites.mean(0)
+            std = momentum * std + (1 - momentum) * elites.std(0)
+            kept, best, value = elites[:num_kept], elites[0], elite_values.mean()
+        assert best is not None and value is not None
+        solution = Solution(actions=best if execute_best else mean, value=value)
+        return solution, ICEMState(_shift(mean, center), _shift(kept, center))
+
+    return TrajectoryOptimizer(init, step)
+
+
+def colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
+    """Draws Gaussian noise of unit variance, correlated along axis -2 (time).
+
+    The power of frequency f is proportional to `1 / f^beta`; entries of the last axis
+    and of the leading axes are independent (Timmer and Koenig, 1995).
+
+    Args:
+      key: consumed.
+      beta: the exponent.
+      shape: `(..., H, A)`.
+
+    Returns:
+      An array of `shape`.
+    """
+    horizon = shape[-2]
+    if horizon == 1:
+        return jax.random.normal(key, shape, jnp.float32)
+    frequency = jnp.fft.rfftfreq(horizon).astype(jnp.float32)
+    # The mean has the power of the lowest frequency, as it would of one still lower.
+    frequency = jnp.maximum(frequency, 1.0 / horizon)
+    scale = frequency ** (-beta / 2)
+    real_key, imaginary_key = jax.random.split(key)
+    half = (*shape[:-2], shape[-1], frequency.shape[0])
+    real = jax.random.normal(real_key, half, jnp.float32)
+    imaginary = jax.random.normal(imaginary_key, half, jnp.float32)
+    # Frequency 0, and for even H the highest, are real; sqrt(2) keeps their power.
+    is_real = jnp.zeros(frequency.shape, bool).at[0].set(True)
+    is_real = is_real.at[-1].set(is_real[-1] | (horizon % 2 == 0))
+    real = jnp.where(is_real, jnp.sqrt(2.0).astype(jnp.float32) * real, real)
+    imaginary = jnp.where(is_real, 0.0, imaginary)
+    weight = jnp.where(is_real, 2.0, 4.0).astype(jnp.float32) * scale**2
+    std = jnp.sqrt(jnp.sum(weight)) / horizon
+    noise = jnp.fft.irfft(jax.lax.complex(scale * real, scale * imaginary), horizon)
+    return (noise / std).swapaxes(-1, -2).astype(jnp.float32)
+
+
+def _shift(sequences: Array, center: Array) -> Array:
+    """Drops the first step of `[..., H, A]` and pads with the middle of the box."""
+    last = jnp.broadcast_to(center, sequences[..., :1, :].shape)
+    return jnp.concatenate([sequences[..., 1:, :], last], axis=-2)

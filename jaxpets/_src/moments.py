@@ -1,0 +1,17 @@
+"""Mean and standard deviation of the filled part of an array of fixed capacity."""
+
+import jax.numpy as jnp
+from jax import Array
+
+# A constant column is not divided by its rounding noise. PETS: 1e-12, in float64.
+_MIN_STD = 1e-6
+
+
+def moments(rows: Array, size: Array) -> tuple[Array, Array]:
+    """Returns mean and std `[F]` of the first `size` rows of `[C, F]`; no std is 0."""
+    used = (jnp.arange(rows.shape[0]) < size)[:, None]
+    count = jnp.maximum(size, 1).astype(jnp.float32)
+    mean = jnp.sum(jnp.where(used, rows, 0.0), axis=0) / count
+    square = jnp.where(used, (rows - mean) ** 2, 0.0)
+    std = jnp.sqrt(jnp.sum(square, axis=0) / count)
+    return mean, jnp.where(std < _MIN_STD, 1.0, std)

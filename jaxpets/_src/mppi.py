@@ -1,0 +1,85 @@
+"""Model-predictive path integral control: a softmax over sampled sequences."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_action_box, check_count, check_real
+from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+
+
+class MPPIState(NamedTuple):
+    """The warm start: the mean of the next search."""
+
+    mean: Array  # [H, A]
+
+
+def mppi(
+    *,
+    horizon: int,
+    action_low: Array,
+    action_high: Array,
+    num_samples: int = 500,
+    num_iterations: int = 1,
+    std: float = 0.5,
+    temperature: float = 1.0,
+) -> TrajectoryOptimizer:
+    """Builds MPPI (Williams et al., 2017).
+
+    `mean = sum_n softmax(value_n / temperature) * a_n` over noisy copies a_n of the
+    last mean. Values are divided by their interquartile range, so that the temperature
+    has no unit.
+
+    Args:
+      horizon: H.
+      action_low: `[A]`.
+      action_high: `[A]`.
+      num_samples: N.
+      num_iterations: iterations per call.
+      std: of the noise, in units of a box scaled to `[-1, 1]`.
+      temperature: 0.1 follows the best few samples, 10 averages over all.
+
+    Returns:
+      A TrajectoryOptimizer; its Solution's value is the weighted mean of the last
+      values.
+
+    Raises:
+      TypeError, ValueError: for a size, number or bound that cannot be searched with.
+    """
+    check_count("horizon", horizon)
+    check_action_box(action_low, action_high)
+    check_count("num_samples", num_samples, minimum=2)
+    check_count("num_iterations", num_iterations)
+    check_real("std", std, 1e-6)
+    check_real("temperature", temperature, 1e-6)
+    center = (action_low + action_high) / 2
+    scale = std * (action_high - action_low) / 2
+    shape = (horizon, center.shape[0])
+
+    def init() -> MPPIState:
+        return MPPIState(mean=jnp.broadcast_to(center, shape))
+
+    def step(
+        objective_fn: ObjectiveFn, key: Array, state: MPPIState
+    ) -> tuple[Solution, MPPIState]:
+        def iterate(mean: Array, key: Array) -> tuple[Array, Array]:
+            sample_key, value_key = jax.random.split(key)
+            noise = jax.random.normal(sample_key, (num_samples, *shape), jnp.float32)
+            actions = jnp.clip(mean + scale * noise, action_low, action_high)
+            values = objective_fn(value_key, actions)
+            # Ranks, not values, set the scale where one candidate has blown up.
+            low, high = jnp.quantile(values, jnp.array([0.25, 0.75], jnp.float32))
+            spread = jnp.maximum(high - low, 1e-6)
+            weights = jax.nn.softmax(
+                (values - jnp.max(values)) / (temperature * spread)
+            )
+            return jnp.einsum("n,nha->ha", weights, actions), jnp.sum(weights * values)
+
+        keys = jax.random.split(key, num_iterations)
+        mean, values = jax.lax.scan(iterate, state.mean, keys)
+        shifted = jnp.concatenate([mean[1:], center[None]])
+        return Solution(actions=mean, value=values[-1]), MPPIState(mean=shifted)
+
+    return TrajectoryOptimizer(init, step)

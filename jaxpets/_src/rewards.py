@@ -1,0 +1,83 @@
+"""Rewards that seek what the ensemble does not know."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_array
+from jaxpets._src.types import RewardFn
+
+
+def epistemic(
+    baseline_variance: Array, obs: Array, action: Array, next_obs: Array
+) -> Array:
+    """Disagreement of the members about where the particles are (section 3.3).
+
+    `r = 1/D * sum_k sqrt(v[k] / w_base[k])`, where `v` is the variance over members of
+    each member's mean particle. It is the spread of the propagated states, not of one
+    step from a common state, so plans are rewarded for leading to the unknown later.
+
+    Args:
+      baseline_variance: `[D]`, w_base in units of obs squared; the paper takes the
+        ensemble's largest aleatoric variance, see `jaxpets.max_variance`.
+      obs: `[E, P, D]`, unused.
+      action: `[A]`, unused; exploration has no action cost.
+      next_obs: `[E, P, D]`.
+
+    Returns:
+      `[]`, without a unit.
+
+    Raises:
+      ValueError: if the shapes do not fit, or there is only one member.
+    """
+    del obs, action
+    check_array("next_obs", next_obs, ["E", "P", "D"])
+    check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
+    _check_members(next_obs.shape[0])
+    variance = jnp.var(jnp.mean(next_obs, axis=1), axis=0)
+    return jnp.mean(jnp.sqrt(variance / baseline_variance))
+
+
+def one_step_disagreement(
+    predict_fn: Callable[[Any, Array, Array], tuple[Array, Array]],
+) -> RewardFn:
+    """Builds the reward of one-step disagreement (the family of Plan2Explore).
+
+    Every particle is shown to all members: `r = 1/D * sum_k sqrt(v[k] / s[k])` with v
+    the variance over members of their predicted means and s the mean of their
+    predicted variances. Unlike `epistemic` it does not count how far the members'
+    paths drifted apart before this step. It costs E times the model of the rollout.
+
+    Args:
+      predict_fn: `(params, obs [E, B, D], action [B, A]) -> (mean, variance)`, both
+        `[E, B, D]`, as `Ensemble.predict`.
+
+    Returns:
+      A RewardFn that returns `[E, P]` and whose params are those of predict_fn.
+    """
+
+    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        del next_obs
+        check_array("obs", obs, ["E", "P", "D"])
+        num_members, per_member, obs_size = obs.shape
+        _check_members(num_members)
+        rows = num_members * per_member
+        shared = jnp.broadcast_to(
+            obs.reshape(rows, obs_size), (num_members, rows, obs_size)
+        )
+        actions = jnp.broadcast_to(action, (rows, *action.shape))
+        mean, variance = predict_fn(params, shared, actions)
+        ratio = jnp.var(mean, axis=0) / jnp.mean(variance, axis=0)
+        return jnp.mean(jnp.sqrt(ratio), -1).reshape(num_members, per_member)
+
+    return reward
+
+
+def _check_members(num_members: int) -> None:
+    if num_members < 2:
+        raise ValueError(
+            "disagreement needs an ensemble of at least 2 members, got "
+            f"{num_members}; the variance over one member is always 0."
+        )

@@ -1,0 +1,189 @@
+"""The contracts of the library: shape letters, data records and Protocols.
+
+Shape letters, used by every docstring of jaxpets:
+
+  N  candidate action sequences (num_samples)
+  H  planning horizon
+  E  ensemble members
+  P  particles per member (num_particles = E * P)
+  B  rows of one member's batch; N * P inside a rollout
+  D  observation size
+  A  action size
+  T  environment steps
+  C  dataset capacity
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+from jax import Array
+
+# The value of a candidate whose return is not finite. Finite itself, so that means
+# over elites stay finite, and far below any return a task can give.
+WORST_VALUE = -1e30
+
+
+class Transition(NamedTuple):
+    """One step of an environment, or a batch of them with equal leading axes."""
+
+    obs: Array  # [..., D]
+    action: Array  # [..., A]
+    next_obs: Array  # [..., D]
+
+
+class Dataset(NamedTuple):
+    """Transitions in arrays of fixed size; when full, the oldest rows are replaced."""
+
+    data: Transition  # [C, ...]; rows from `size` on hold zeros
+    size: Array  # [] int32, valid rows
+    cursor: Array  # [] int32, the next row to write
+
+
+class PlanParams(NamedTuple):
+    """Everything about planning that may change between calls without a retrace."""
+
+    dynamics: Any  # forwarded to rollout_fn
+    reward: Any = ()  # forwarded to reward_fn
+
+
+class Solution(NamedTuple):
+    """What a trajectory optimizer found."""
+
+    actions: Array  # [H, A]
+    value: Array  # [] mean value of the last elites
+
+
+class PlanOutput(NamedTuple):
+    """What a planner decided."""
+
+    action: Array  # [A] to execute now
+    actions: Array  # [H, A] the whole plan
+    value: Array  # [] the plan's return under the model, summed over the horizon
+
+
+class EnvState(NamedTuple):
+    """State of an environment. It has no reward: phase 1 of the paper has none."""
+
+    obs: Array  # [D]
+    physics: Any  # whatever the simulator needs to go on
+
+
+class DynamicsFn(Protocol):
+    """A model that moves particles by one step."""
+
+    def __call__(self, params: Any, key: Array, obs: Array, action: Array) -> Array:
+        """Samples the next observation of every particle, each with its own member.
+
+        Args:
+          params: anything the model needs.
+          key: consumed.
+          obs: `[E, B, D]`; row block e belongs to member e.
+          action: `[B, A]`, shared by the members.
+
+        Returns:
+          `[E, B, D]`, the next observations.
+        """
+        ...
+
+
+class RolloutFn(Protocol):
+    """An imagination: action sequences in, observation paths out."""
+
+    def __call__(self, params: Any, key: Array, obs: Any, actions: Array) -> Array:
+        """Rolls N action sequences out from one start.
+
+        Args:
+          params: anything the model needs.
+          key: consumed.
+          obs: `[D]`, or whatever start state this rollout understands.
+          actions: `[N, H, A]`.
+
+        Returns:
+          `[N, H+1, E, P, D]` observations; index 0 along time is the start.
+        """
+        ...
+
+
+class RewardFn(Protocol):
+    """A reward of one imagined step of one candidate, given its whole particle set."""
+
+    def __call__(
+        self, params: Any, obs: Array, action: Array, next_obs: Array
+    ) -> Array:
+        """Rewards one step.
+
+        Args:
+          params: reward data: task weights, a baseline variance, a count table, ().
+          obs: `[E, P, D]`.
+          action: `[A]`.
+          next_obs: `[E, P, D]`.
+
+        Returns:
+          `[E, P]`, averaged by the planner, or `[]` if the set is already reduced.
+        """
+        ...
+
+
+class ObjectiveFn(Protocol):
+    """The function a trajectory optimizer maximises."""
+
+    def __call__(self, key: Array, actions: Array) -> Array:
+        """Values `[N]` of sequences `[N, H, A]`: higher is better, always finite."""
+        ...
+
+
+class TrajectoryOptimizer(NamedTuple):
+    """A search over action sequences; its state is the warm start.
+
+    init: `() -> state`.
+    step: `(objective_fn, key, state) -> (Solution, state)`; the state that comes out
+      is already shifted by one step.
+    """
+
+    init: Callable[[], Any]
+    step: Callable[[ObjectiveFn, Array, Any], tuple[Solution, Any]]
+
+
+class Planner(NamedTuple):
+    """A policy that plans.
+
+    init: `() -> state`; call it at the start of every trial.
+    step: `(PlanParams, key, state, obs) -> (PlanOutput, state)`.
+    """
+
+    init: Callable[[], Any]
+    step: Callable[[PlanParams, Array, Any, Any], tuple[PlanOutput, Any]]
+
+
+class Env(NamedTuple):
+    """A simulator of one environment; batch it with `jax.vmap`.
+
+    reset: `(key) -> EnvState`.
+    step: `(EnvState, action [A]) -> EnvState`.
+    action_low, action_high: `[A]`, finite.
+    """
+
+    reset: Callable[[Array], EnvState]
+    step: Callable[[EnvState, Array], EnvState]
+    action_low: Array
+    action_high: Array
+
+
+class ModelSpace(NamedTuple):
+    """The coordinates in which a model sees observations.
+
+    The law `next_obs(o, target(o, x)) == x` must hold. A predicted variance is taken
+    to be the variance of the next observation, so `next_obs` should add the target
+    to something that it does not stretch.
+
+    features: `(obs [..., D]) -> [..., F]`, what the network reads.
+    target: `(obs, next_obs) -> [..., D]`, what it predicts.
+    next_obs: `(obs, target) -> [..., D]`, the inverse of `target`.
+    bound: `(obs, low [D], high [D]) -> [..., D]`, keeps imagined observations in a
+      box. Leave free what grows without limit in the world, as an unwrapped angle.
+    """
+
+    features: Callable[[Array], Array]
+    target: Callable[[Array, Array], Array]
+    next_obs: Callable[[Array, Array], Array]
+    bound: Callable[[Array, Array, Array], Array]

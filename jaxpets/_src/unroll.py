@@ -1,0 +1,77 @@
+"""An environment and a planner, stepped together in one scan."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_count, check_key
+from jaxpets._src.types import (
+    Env,
+    EnvState,
+    Planner,
+    PlanOutput,
+    PlanParams,
+    Transition,
+)
+
+
+class UnrollState(NamedTuple):
+    """Where a trial stands; a trial may be unrolled in parts."""
+
+    env: EnvState
+    planner: Any
+    step: Array  # [] int32, environment steps since the reset
+
+
+def start(env: Env, planner: Planner, key: Array) -> UnrollState:
+    """Resets the environment and the planner for a new trial; the key is consumed."""
+    return UnrollState(env.reset(key), planner.init(), jnp.zeros((), jnp.int32))
+
+
+def unroll(
+    env: Env,
+    planner: Planner,
+    params: PlanParams,
+    key: Array,
+    state: UnrollState,
+    *,
+    length: int,
+) -> tuple[UnrollState, Transition, PlanOutput]:
+    """Runs the planner in the environment for T = `length` steps.
+
+    Step t uses the key `fold_in(key, t)` with t counted from the reset, so a trial
+    unrolled in parts with one key is the same trial.
+
+    Args:
+      env: where to act.
+      planner: how to act.
+      params: forwarded to the planner.
+      key: consumed by the whole trial.
+      state: from `start`, or from the last part.
+      length: T.
+
+    Returns:
+      The state after T steps, the transitions `[T, ...]` and the plans `[T, ...]`.
+
+    Raises:
+      TypeError, ValueError: unless length is a positive Python integer and key a key.
+    """
+    check_count("length", length)
+    check_key("key", key)
+
+    def tick(state: UnrollState, _: None) -> tuple[UnrollState, tuple]:
+        plan_key = jax.random.fold_in(key, state.step)
+        output, planner_state = planner.step(
+            params, plan_key, state.planner, state.env.obs
+        )
+        env_state = env.step(state.env, output.action)
+        transition = Transition(state.env.obs, output.action, env_state.obs)
+        return UnrollState(env_state, planner_state, state.step + 1), (
+            transition,
+            output,
+        )
+
+    state, (transitions, outputs) = jax.lax.scan(tick, state, None, length=length)
+    return state, transitions, outputs

@@ -1,0 +1,221 @@
+"""HalfCheetah as PETS has it: the model of gymnasium, stepped by MJX on any device.
+
+Differences to other HalfCheetahs: the observation has 18 entries and begins with the
+forward velocity over the whole environment step; every trial starts within 0.001 of
+the same state; nothing ends a trial; all geoms hit the floor (not so in Brax).
+"""
+
+import importlib.resources
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from jax import Array
+
+from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.types import Env, EnvState, ModelSpace
+
+OBS_SIZE = 18
+ACTION_SIZE = 6
+TIMESTEP = 0.05  # s per environment step
+
+# Entries of the observation.
+FORWARD_VELOCITY = 0  # m/s, (x' - x) / TIMESTEP over the last environment step
+HEIGHT = 1  # m, of the torso relative to its start
+PITCH = 2  # rad, unwrapped, positive is nose down
+JOINT_ANGLES = slice(3, 9)  # rad: thigh, shin, foot of the back and the front leg
+X_VELOCITY = 9  # m/s, at this instant
+Z_VELOCITY = 10  # m/s
+PITCH_RATE = 11  # rad/s, positive rolls forward
+JOINT_VELOCITIES = slice(12, 18)  # rad/s
+
+_FRAME_SKIP = 5
+_RESET_STD = 0.001
+# 1000 kg/m^3 (MuJoCo's default) scaled to the total mass of 14 kg that the file asks
+# for by `settotalmass`, an attribute MuJoCo is about to drop.
+_DENSITY = "660.8849500774735"
+
+
+class Physics(NamedTuple):
+    """The part of MuJoCo's state from which the rest follows."""
+
+    qpos: Array  # [9]
+    qvel: Array  # [9]
+    qacc_warmstart: Array  # [9], where the contact solver starts
+
+
+class TaskWeights(NamedTuple):
+    """A task as data: `velocity * v + pitch_rate * omega - control * ||a||^2`."""
+
+    velocity: Array  # []
+    pitch_rate: Array  # []
+    control: Array  # []
+
+
+TASK_NAMES = ("forward", "backward", "front-flip", "back-flip")
+
+
+def tasks() -> TaskWeights:
+    """Returns the four tasks of the paper, stacked `[4]` in the order of TASK_NAMES.
+
+    Figure 3 of the paper, named by physics: a positive pitch rate is nose down, so it
+    turns front flips. The figure has the two flips the other way round.
+    """
+    return TaskWeights(
+        velocity=jnp.array([1.0, -1.0, 0.0, 0.0], jnp.float32),
+        pitch_rate=jnp.array([0.0, 0.0, 1.0, -1.0], jnp.float32),
+        control=jnp.full((4,), 0.1, jnp.float32),
+    )
+
+
+def task(name: str) -> TaskWeights:
+    """Returns one task, scalar weights.
+
+    Raises:
+      ValueError: if the name is not in TASK_NAMES.
+    """
+    if name not in TASK_NAMES:
+        raise ValueError(f"task must be one of {', '.join(TASK_NAMES)}, got {name!r}.")
+    return jax.tree.map(lambda weight: weight[TASK_NAMES.index(name)], tasks())
+
+
+def task_reward(
+    weights: TaskWeights, obs: Array, action: Array, next_obs: Array
+) -> Array:
+    """Rewards one step of a task; also scores recorded trials, `[T, D]` and `[T, A]`.
+
+    Args:
+      weights: scalars, from `task`, or one row of `tasks`.
+      obs: unused; PETS rewards the state that was reached.
+      action: `[A]`, or `[..., A]` with the leading shape of next_obs.
+      next_obs: `[..., D]`.
+
+    Returns:
+      `[...]`, in m/s or rad/s.
+    """
+    del obs
+    check_array("next_obs", next_obs, ["...", OBS_SIZE])
+    motion = (
+        weights.velocity * next_obs[..., FORWARD_VELOCITY]
+        + weights.pitch_rate * next_obs[..., PITCH_RATE]
+    )
+    return motion - weights.control * jnp.sum(action**2, axis=-1)
+
+
+def model_space() -> ModelSpace:
+    """Returns the coordinates of PETS for this observation.
+
+    Features drop the finite-difference velocity and show the pitch as sine and
+    cosine: `[F] = 18`. Targets are changes, but for that velocity, which is predicted
+    itself. Imagined states are bounded except for the pitch, which grows by a turn a
+    second in a flip.
+    """
+
+    def features(obs: Array) -> Array:
+        pitch = obs[..., PITCH, None]
+        rest = obs[..., PITCH + 1 :]
+        parts = [obs[..., HEIGHT, None], jnp.sin(pitch), jnp.cos(pitch), rest]
+        return jnp.concatenate(parts, axis=-1)
+
+    # What the targets are relative to: everything but the velocity.
+    relative = jnp.ones((OBS_SIZE,), jnp.float32).at[FORWARD_VELOCITY].set(0.0)
+    bounded = jnp.arange(OBS_SIZE) != PITCH
+
+    def bound(obs: Array, low: Array, high: Array) -> Array:
+        low = jnp.where(bounded, low, -jnp.inf)
+        return jnp.clip(obs, low, jnp.where(bounded, high, jnp.inf))
+
+    return ModelSpace(
+        features=features,
+        target=lambda obs, next_obs: next_obs - relative * obs,
+        next_obs=lambda obs, target: relative * obs + target,
+        bound=bound,
+    )
+
+
+def load_model() -> mujoco.MjModel:
+    """Returns gymnasium's HalfCheetah as a compiled MuJoCo model."""
+    assets = importlib.resources.files("gymnasium.envs.mujoco") / "assets"
+    root = ElementTree.fromstring((assets / "half_cheetah.xml").read_text())
+    compiler, geom = root.find("compiler"), root.find("default/geom")
+    assert compiler is not None and geom is not None
+    # Deprecated and inert in today's MuJoCo; equal masses come from the density.
+    for name in ("settotalmass", "coordinate"):
+        compiler.attrib.pop(name, None)
+    geom.set("density", _DENSITY)
+    return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, "unicode"))
+
+
+def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
+    """Builds HalfCheetah on MJX.
+
+    Args:
+      iterations: of the contact solver. Fewer than 5 are wrong once the robot lies on
+        its back; MuJoCo needs at most 5 there.
+      ls_iterations: of its line search; MJX always runs all of them.
+
+    Returns:
+      An Env with observations `[18]` and actions `[6]` in [-1, 1].
+
+    Raises:
+      TypeError, ValueError: unless the two are positive Python integers.
+    """
+    check_count("iterations", iterations)
+    check_count("ls_iterations", ls_iterations)
+    # Imported here, because the import writes to stdout where warp is not installed.
+    from mujoco import mjx
+
+    host_model = load_model()
+    host_model.opt.iterations = iterations
+    host_model.opt.ls_iterations = ls_iterations
+    model = mjx.put_model(host_model, impl="jax")
+    template = mjx.make_data(host_model, impl="jax")
+    qpos0 = jnp.asarray(host_model.qpos0, jnp.float32)
+
+    def observe(velocity: Array, physics: Physics) -> Array:
+        return jnp.concatenate([velocity[None], physics.qpos[1:], physics.qvel])
+
+    def reset(key: Array) -> EnvState:
+        qpos_key, qvel_key = jax.random.split(key)
+        physics = Physics(
+            qpos=qpos0 + _RESET_STD * jax.random.normal(qpos_key, (9,), jnp.float32),
+            qvel=_RESET_STD * jax.random.normal(qvel_key, (9,), jnp.float32),
+            qacc_warmstart=jnp.zeros((9,), jnp.float32),
+        )
+        return EnvState(observe(jnp.zeros((), jnp.float32), physics), physics)
+
+    def step(state: EnvState, action: Array) -> EnvState:
+        check_array("action", action, [ACTION_SIZE])
+        before = state.physics
+        data = template.replace(
+            qpos=before.qpos,
+            qvel=before.qvel,
+            qacc_warmstart=before.qacc_warmstart,
+            ctrl=action,
+        )
+        # GPUs multiply in TF32 by default: an error 400 times that of float32. And MJX
+        # does not trace under strict promotion, which a caller may have set.
+        with (
+            jax.default_matmul_precision("highest"),
+            jax.numpy_dtype_promotion("standard"),
+        ):
+            data = jax.lax.fori_loop(
+                0, _FRAME_SKIP, lambda _, data: mjx.step(model, data), data
+            )
+        physics = Physics(data.qpos, data.qvel, data.qacc_warmstart)
+        velocity = (physics.qpos[0] - before.qpos[0]) / TIMESTEP
+        return EnvState(observe(velocity, physics), physics)
+
+    low = -jnp.ones((ACTION_SIZE,), jnp.float32)
+    return Env(reset, step, action_low=low, action_high=-low)
+
+
+def qpos_from_obs(obs: Array) -> Array:
+    """Returns the joint positions `[T, 9]` of a recorded trial `[T, 18]`.
+
+    The observation leaves out where the robot is; its velocity over each step says it.
+    """
+    x = jnp.cumsum(obs[:, FORWARD_VELOCITY] * TIMESTEP)
+    return jnp.concatenate([x[:, None], obs[:, HEIGHT:X_VELOCITY]], axis=-1)

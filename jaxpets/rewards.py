@@ -1,0 +1,20 @@
+"""Exploration rewards, all of them plain functions for `jaxpets.plan`."""
+
+from jaxpets._src.pseudo_counts import (
+    PseudoCounts,
+    count_states,
+    lookup,
+    pseudo_count,
+    simhash,
+)
+from jaxpets._src.rewards import epistemic, one_step_disagreement
+
+__all__ = [
+    "PseudoCounts",
+    "count_states",
+    "epistemic",
+    "lookup",
+    "one_step_disagreement",
+    "pseudo_count",
+    "simhash",
+]
