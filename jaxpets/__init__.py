@@ -2,7 +2,7 @@
 
 from jaxpets import rewards
 from jaxpets._src.cem import CEMState, cem
-from jaxpets._src.dataset import append, init_dataset
+from jaxpets._src.dataset import append, grow, init_dataset
 from jaxpets._src.ensemble import (
     Ensemble,
     EnsembleConfig,
@@ -77,6 +77,7 @@ __all__ = [
     "delta_space",
     "ensemble",
     "fit",
+    "grow",
     "icem",
     "init_dataset",
     "learner",

@@ -1,6 +1,7 @@
 """A dataset of fixed capacity, so that it grows without a retrace."""
 
 import jax.numpy as jnp
+from jax import Array
 
 from jaxpets._src.checks import check_array, check_count
 from jaxpets._src.types import Dataset, Transition
@@ -55,3 +56,26 @@ def append(dataset: Dataset, transitions: Transition) -> Dataset:
     )
     size = jnp.minimum(dataset.size + length, capacity)
     return Dataset(data, size, (dataset.cursor + length) % capacity)
+
+
+def grow(dataset: Dataset, capacity: int) -> Dataset:
+    """Returns the dataset with room for `capacity` rows, the oldest row first.
+
+    Args:
+      dataset: what there is.
+      capacity: at least the present one.
+
+    Raises:
+      TypeError, ValueError: if capacity is no integer, or smaller than it was.
+    """
+    old = dataset.data.obs.shape[0]
+    check_count("capacity", capacity, minimum=old)
+
+    def widen(rows: Array) -> Array:
+        rows = jnp.roll(
+            rows, jnp.where(dataset.size == old, -dataset.cursor, 0), axis=0
+        )
+        return jnp.pad(rows, ((0, capacity - old), (0, 0)))
+
+    data = Transition(*(widen(rows) for rows in dataset.data))
+    return Dataset(data, dataset.size, dataset.size % capacity)

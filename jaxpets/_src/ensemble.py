@@ -17,7 +17,7 @@ from jaxpets._src.types import DynamicsFn, ModelSpace, Transition
 
 
 class Precision(enum.Enum):
-    """How the matrix products of the network are computed; sums are always float32."""
+    """How the matrix products of the network are computed; they add up in float32."""
 
     F32 = "f32"
     TF32 = "tf32"  # float32 where the hardware has no TF32
@@ -268,7 +268,8 @@ class _Network(nn.Module):
     def _dense(self, index: int, size: int, x: Array) -> Array:
         # PETS: normal cut at two deviations, std = 1 / (2 sqrt(fan_in)); zero biases.
         init = nn.initializers.truncated_normal(1.0 / (2.0 * x.shape[-1] ** 0.5))
-        product = functools.partial(_dot_general, self.precision)
+        is_output = index == len(self.hidden_sizes)
+        product = functools.partial(_dot_general, self.precision, is_output)
         layer = nn.Dense(
             size, kernel_init=init, dot_general=product, name=f"layer_{index}"
         )
@@ -276,16 +277,22 @@ class _Network(nn.Module):
 
 
 def _dot_general(
-    wanted: Precision, lhs: Array, rhs: Array, dimension_numbers: Any, **_: Any
+    wanted: Precision,
+    is_output: bool,
+    lhs: Array,
+    rhs: Array,
+    dimension_numbers: Any,
+    **_: Any,
 ) -> Array:
-    """`lax.dot_general` in the wanted precision, with a float32 result."""
+    """`lax.dot_general` in the wanted precision, as float32."""
+    exact = jax.lax.Precision.HIGHEST if wanted is Precision.F32 else None
+    dtype = jnp.float32
     if wanted is Precision.BF16:
         lhs, rhs = lhs.astype(jnp.bfloat16), rhs.astype(jnp.bfloat16)
-    exact = jax.lax.Precision.HIGHEST if wanted is Precision.F32 else None
-    return jax.lax.dot_general(
-        lhs,
-        rhs,
-        dimension_numbers,
-        precision=exact,
-        preferred_element_type=jnp.float32,
+        # Hidden products are rounded anyway when the next layer reads them; written as
+        # bfloat16 they are half the traffic, a fifth of a plan's time on an H200.
+        dtype = jnp.float32 if is_output else jnp.bfloat16
+    product = jax.lax.dot_general(
+        lhs, rhs, dimension_numbers, precision=exact, preferred_element_type=dtype
     )
+    return product.astype(jnp.float32)

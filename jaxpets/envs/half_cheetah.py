@@ -5,7 +5,9 @@ forward velocity over the whole environment step; every trial starts within 0.00
 the same state; nothing ends a trial; all geoms hit the floor (not so in Brax).
 """
 
+import contextlib
 import importlib.resources
+import io
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -164,8 +166,9 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     """
     check_count("iterations", iterations)
     check_count("ls_iterations", ls_iterations)
-    # Imported here, because the import writes to stdout where warp is not installed.
-    from mujoco import mjx
+    # MJX writes to stdout when it finds no warp, which it does not need here.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
 
     host_model = load_model()
     host_model.opt.iterations = iterations

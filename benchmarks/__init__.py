@@ -1,0 +1,1 @@
+"""Benchmarks of jaxpets, each a program: `python -m benchmarks.plan --help`."""

@@ -1,0 +1,35 @@
+"""The set that is run on a GPU: plan, fit, rollout and env, in a few minutes."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks import env, fit, plan, rollout, rows
+
+SET = (
+    (plan, "--precision bf16 tf32 --seeds 1 4 16"),
+    (plan, "--precision f32 --seeds 1"),
+    (fit, "--seeds 1 4 16"),
+    (rollout, "--precision bf16 tf32 f32"),
+    (env, "--batch 1 256"),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Runs the set; every row is on disk as soon as it is measured."""
+    args = rows.parser(__doc__).parse_args(argv)
+    common = ["--repeats", str(args.repeats)]
+    if args.tiny:
+        common.append("--tiny")
+    if args.json is not None:
+        common += ["--json", str(args.json)]
+    begin = time.perf_counter()
+    done = []
+    for module, flags in SET:
+        done += module.main([*flags.split(), *common])
+        print(f"{time.perf_counter() - begin:.0f} s so far\n", flush=True)
+    return done
+
+
+if __name__ == "__main__":
+    main()

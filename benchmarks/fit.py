@@ -1,0 +1,65 @@
+"""Time of one gradient step of the ensemble, over seeds that train side by side.
+
+What is timed is a call of `Fitter.step`: scaler, bootstraps, shuffles and all updates.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+
+from benchmarks import rows, timing, workloads
+
+COLUMNS = ("seeds", "rows", "capacity", "updates", "compile_s", "min_ms", "median_ms",
+           "us_per_update")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yields a row for every number of seeds."""
+    size = workloads.SIZES["tiny" if args.tiny else "paper"]
+    num_rows = 100 if args.tiny else args.rows
+    capacity = max(num_rows, args.capacity or 0)
+    fitter = workloads.fitter(size, args.epochs, args.batch_size)
+    updates = args.epochs * -(-num_rows // args.batch_size)
+    for seeds in args.seeds:
+        keys = jax.random.split(jax.random.key(0), seeds)
+        params, state, data = workloads.prepare_fit(
+            size, fitter, keys, num_rows, capacity
+        )
+        result = timing.measure(
+            jax.vmap(fitter.step), params, keys, state, data, repeats=args.repeats
+        )
+        sizes = {
+            "seeds": seeds,
+            "rows": num_rows,
+            "capacity": capacity,
+            "updates": updates,
+            "batch_size": args.batch_size,
+            "num_members": size.num_members,
+            "hidden_sizes": size.hidden_sizes,
+        }
+        yield rows.make_row(
+            "fit",
+            sizes,
+            **result._asdict(),
+            us_per_update=1e3 * result.median_ms / updates,
+        )
+
+
+def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Parses the flags, measures and reports."""
+    parser = rows.parser(__doc__)
+    parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1, 4, 16])
+    parser.add_argument("--rows", type=rows.positive, default=3000, help="of data")
+    parser.add_argument(
+        "--capacity", type=rows.positive, help="of the dataset; as many as rows if less"
+    )
+    parser.add_argument("--epochs", type=rows.positive, default=5)
+    parser.add_argument("--batch-size", type=rows.positive, default=32)
+    args = parser.parse_args(argv)
+    return rows.report(run(args), COLUMNS, args.json)
+
+
+if __name__ == "__main__":
+    main()

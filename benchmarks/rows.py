@@ -1,0 +1,86 @@
+"""What a benchmark reports: a table on the screen, and rows of JSON in a file."""
+
+import argparse
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "torch", "mbrl")
+
+
+def environment() -> dict[str, Any]:
+    """Returns where and when a row was measured; loads no package itself."""
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    if "jaxpets" in sys.modules:
+        versions["jaxpets"] = sys.modules["jaxpets"].__version__
+    device = "cpu"
+    if "jax" in sys.modules:
+        device = sys.modules["jax"].devices()[0].device_kind
+    now = datetime.datetime.now(datetime.UTC)
+    return {
+        "date": now.isoformat(timespec="seconds"),
+        "device": device,
+        "cpus": os.cpu_count(),
+        "versions": versions,
+    }
+
+
+def make_row(benchmark: str, sizes: dict[str, Any], **results: Any) -> dict[str, Any]:
+    """Returns one row: what was run, where, at which sizes, and what came out."""
+    return {"benchmark": benchmark, **environment(), "sizes": sizes, **results}
+
+
+def report(
+    rows: Iterable[dict[str, Any]], columns: tuple[str, ...], path: Path | None
+) -> list[dict[str, Any]]:
+    """Prints each row, and appends it to `path`, as soon as it is there."""
+    done = []
+    for row in rows:
+        if not done:
+            print(f"{row['benchmark']} on {row['device']}", flush=True)
+            print("  ".join(f"{column:>12}" for column in columns), flush=True)
+        cells = (row.get(column, row["sizes"].get(column)) for column in columns)
+        print("  ".join(f"{_text(cell):>12}" for cell in cells), flush=True)
+        if path is not None:
+            with path.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        done.append(row)
+    return done
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """Returns a parser with the flags that all benchmarks share."""
+    flags = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    flags.add_argument("--json", type=Path, help="append rows to this file, as JSONL")
+    flags.add_argument("--repeats", type=positive, default=10, help="measured runs")
+    flags.add_argument(
+        "--tiny", action="store_true", help="toy sizes, to see that it runs"
+    )
+    return flags
+
+
+def positive(text: str) -> int:
+    """Parses a positive integer, for argparse."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
+    return number
+
+
+def _text(cell: Any) -> str:
+    if cell is None:
+        return "-"
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)

@@ -1,0 +1,73 @@
+"""Compile time apart from run time, and one callable against another."""
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+
+class Timing(NamedTuple):
+    """How long one program takes."""
+
+    compile_s: float  # tracing, lowering and compiling
+    min_ms: float  # of `repeats` runs
+    median_ms: float
+    repeats: int
+
+
+class Ratio(NamedTuple):
+    """How long two callables take that were run in turn."""
+
+    first_ms: float  # medians
+    second_ms: float
+    ratio: float  # median of first / second, pair by pair
+    ratio_of_min: float  # of the fastest runs: what an undisturbed machine would show
+    repeats: int
+
+
+def compile_program(
+    function: Callable[..., Any], *args: Any
+) -> tuple[Callable[..., Any], float]:
+    """Returns `function` compiled for `args`, and the seconds that this took."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    return compiled, time.perf_counter() - start
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Returns how long a call takes until all its results have arrived."""
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - start
+
+
+def summarize(times: list[float], compile_s: float = 0.0) -> Timing:
+    """Returns the Timing of runs given in seconds."""
+    median = statistics.median(times)
+    return Timing(compile_s, 1e3 * min(times), 1e3 * median, len(times))
+
+
+def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:
+    """Compiles `function`, runs it once unmeasured and then `repeats` times."""
+    compiled, compile_s = compile_program(function, *args)
+    seconds(lambda: compiled(*args))
+    times = [seconds(lambda: compiled(*args)) for _ in range(repeats)]
+    return summarize(times, compile_s)
+
+
+def compare(
+    first: Callable[[], Any], second: Callable[[], Any], *, repeats: int
+) -> Ratio:
+    """Runs two callables in turn, so that both see the same state of the machine."""
+    seconds(first)
+    seconds(second)
+    pairs = [(seconds(first), seconds(second)) for _ in range(repeats)]
+    return Ratio(
+        first_ms=1e3 * statistics.median(pair[0] for pair in pairs),
+        second_ms=1e3 * statistics.median(pair[1] for pair in pairs),
+        ratio=statistics.median(first / second for first, second in pairs),
+        ratio_of_min=min(pair[0] for pair in pairs) / min(pair[1] for pair in pairs),
+        repeats=repeats,
+    )

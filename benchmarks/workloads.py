@@ -1,0 +1,187 @@
+"""The work that is timed: planning and training on HalfCheetah.
+
+Weights are as initialised and the data are drawn, not simulated: no program here takes
+longer or shorter for other values.
+"""
+
+import argparse
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+import jaxpets
+from jaxpets.envs import half_cheetah
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """How much a planner imagines, with which network; the defaults are the paper's."""
+
+    num_samples: int = 500
+    num_elites: int = 50
+    num_iterations: int = 5
+    horizon: int = 30
+    num_particles: int = 20
+    num_members: int = 5
+    hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
+
+
+SIZES = {
+    "paper": Size(),
+    "laptop": Size(64, 10, 3, 15, 5),
+    "tiny": Size(16, 4, 2, 3, 5, hidden_sizes=(8, 8, 8, 8)),
+}
+PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
+OPTIMIZERS = ("cem", "icem")
+REWARDS = ("epistemic", "task")
+
+
+def add_size_flag(parser: argparse.ArgumentParser) -> None:
+    """Adds `--size`."""
+    parser.add_argument(
+        "--size", choices=("paper", "laptop"), default="paper", help="of the planner"
+    )
+
+
+def chosen_size(args: argparse.Namespace) -> Size:
+    """Returns the size that `--size` and `--tiny` ask for."""
+    return SIZES["tiny" if args.tiny else args.size]
+
+
+def model(size: Size, precision: str) -> jaxpets.Ensemble:
+    """Returns the ensemble of PETS on HalfCheetah."""
+    config = jaxpets.EnsembleConfig(
+        num_members=size.num_members,
+        hidden_sizes=size.hidden_sizes,
+        precision=jaxpets.Precision(precision),
+    )
+    return jaxpets.ensemble(
+        config,
+        half_cheetah.model_space(),
+        obs_size=half_cheetah.OBS_SIZE,
+        action_size=half_cheetah.ACTION_SIZE,
+    )
+
+
+def rollout_fn(size: Size, precision: str) -> jaxpets.RolloutFn:
+    """Returns the particle rollout of the ensemble."""
+    return jaxpets.particle_rollout(
+        model(size, precision).sample,
+        num_members=size.num_members,
+        num_particles=size.num_particles,
+    )
+
+
+def optimizer(size: Size, name: str) -> jaxpets.TrajectoryOptimizer:
+    """Returns `cem` or `icem` at this size."""
+    one = jnp.ones((half_cheetah.ACTION_SIZE,), jnp.float32)
+    build = {"cem": jaxpets.cem, "icem": jaxpets.icem}[name]
+    return build(
+        horizon=size.horizon,
+        action_low=-one,
+        action_high=one,
+        num_samples=size.num_samples,
+        num_elites=size.num_elites,
+        num_iterations=size.num_iterations,
+    )
+
+
+def planner(
+    size: Size, precision: str, search: str = "cem", reward: str = "epistemic"
+) -> jaxpets.Planner:
+    """Returns the model-predictive controller of PETS."""
+    rewards = {
+        "epistemic": jaxpets.rewards.epistemic,
+        "task": half_cheetah.task_reward,
+    }
+    return jaxpets.plan(
+        rollout_fn(size, precision), rewards[reward], optimizer(size, search)
+    )
+
+
+def fitter(size: Size, num_epochs: int = 5, batch_size: int = 32) -> jaxpets.Fitter:
+    """Returns the trainer of PETS, in TF32 where the hardware has it."""
+    config = jaxpets.FitConfig(num_epochs=num_epochs, batch_size=batch_size)
+    return jaxpets.fit(model(size, "tf32"), optax.adam(1e-3), config)
+
+
+def transitions(key: Array, num_rows: int) -> jaxpets.Transition:
+    """Draws transitions with about the spread of HalfCheetah's, `[num_rows, ...]`."""
+    obs_key, action_key, change_key = jax.random.split(key, 3)
+    std = jnp.array([0.6, 0.05, 0.5, *[0.3] * 6, 0.8, 0.8, 1.8, *[9.0] * 6])
+    shape = (num_rows, half_cheetah.OBS_SIZE)
+    obs = std * jax.random.normal(obs_key, shape, jnp.float32)
+    change = 0.3 * std * jax.random.normal(change_key, shape, jnp.float32)
+    action_shape = (num_rows, half_cheetah.ACTION_SIZE)
+    action = jax.random.uniform(action_key, action_shape, jnp.float32, -1.0, 1.0)
+    return jaxpets.Transition(obs, action, obs + change)
+
+
+def dataset(key: Array, num_rows: int, capacity: int) -> jaxpets.Dataset:
+    """Returns a dataset with `num_rows` drawn transitions."""
+    empty = jaxpets.init_dataset(
+        capacity, half_cheetah.OBS_SIZE, half_cheetah.ACTION_SIZE
+    )
+    return jaxpets.append(empty, transitions(key, num_rows))
+
+
+def params(size: Size, key: Array) -> jaxpets.EnsembleParams:
+    """Returns an ensemble as initialised, with a scaler fitted to drawn data."""
+    init_key, data_key = jax.random.split(key)
+    ensemble = model(size, "tf32")
+    data = transitions(data_key, 1000)
+    scaler = ensemble.fit_scaler(data, jnp.asarray(1000, jnp.int32))
+    return ensemble.init(init_key)._replace(scaler=scaler)
+
+
+def prepare_fit(
+    size: Size, fitter: jaxpets.Fitter, keys: Array, num_rows: int, capacity: int
+) -> tuple[jaxpets.EnsembleParams, jaxpets.FitState, jaxpets.Dataset]:
+    """Returns what a fitter reads, one of each per key."""
+
+    def prepare(key: Array) -> tuple:
+        model_key, data_key = jax.random.split(key)
+        start = params(size, model_key)
+        return start, fitter.init(start), dataset(data_key, num_rows, capacity)
+
+    return jax.jit(jax.vmap(prepare))(keys)
+
+
+def plan_params(size: Size, key: Array, reward: str) -> jaxpets.PlanParams:
+    """Returns what a planner of one seed reads."""
+    dynamics = params(size, key)
+    if reward == "task":
+        return jaxpets.PlanParams(dynamics, half_cheetah.task("forward"))
+    return jaxpets.PlanParams(dynamics, jaxpets.max_variance(dynamics))
+
+
+def candidates_per_action(size: Size, search: str) -> int:
+    """Returns how many action sequences are rolled out for one action."""
+    if search == "cem":
+        return size.num_samples * size.num_iterations
+    counts = []  # iCEM's population shrinks; ask it, without running it
+
+    def objective(key: Array, actions: Array) -> Array:
+        del key
+        counts.append(actions.shape[0])
+        return jnp.zeros(actions.shape[:1], jnp.float32)
+
+    built = optimizer(size, search)
+    jax.eval_shape(lambda key: built.step(objective, key, built.init()),
+                   jax.random.key(0))  # fmt: skip
+    return sum(counts)
+
+
+def rollout_flops(size: Size, num_candidates: int) -> float:
+    """Returns the operations in the network's matrix products, two per multiply-add."""
+    widths = (
+        half_cheetah.OBS_SIZE + half_cheetah.ACTION_SIZE,  # pitch as sine and cosine,
+        *size.hidden_sizes,  # but no finite-difference velocity
+        2 * half_cheetah.OBS_SIZE,
+    )
+    per_row = sum(a * b for a, b in itertools.pairwise(widths))
+    return 2.0 * per_row * num_candidates * size.num_particles * size.horizon

@@ -1,0 +1,170 @@
+"""From the command line to a Config, and from a Config to JSON and back."""
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from experiments import rundir
+from experiments.config import Config, preset, validate
+from experiments.errors import CheckpointError, UsageError
+
+PRESETS = ("laptop", "paper", "smoke")
+ARMS = ("epistemic", "count", "random", "oracle", "one-step")
+
+# Where a later phase may differ from the run that it starts from.
+LATER = (
+    "phase", "task", "out", "name", "source", "at_trial", "video", "eval_trials",
+    "finetune_trials", "chunk_length", "milestones", "allow_cpu", "debug", "planner",
+)  # fmt: skip
+# Where a run that is continued may differ from its start.
+CONTINUED = ("out", "name", "video", "allow_cpu", "debug", "chunk_length", "source")
+
+
+def parse(argv: Sequence[str]) -> Config:
+    """Returns the validated Config of a command line.
+
+    zero-shot and finetune take their defaults from the run they start from, so that a
+    preset or a number need not be said twice.
+
+    Raises:
+      UsageError: with one line for the user.
+      SystemExit: after `--help`.
+    """
+    first = _first_flags(argv)
+    default = preset(first.preset)
+    if first.phase in ("zero-shot", "finetune"):
+        default = _explored(first, default)
+    config = _tyro(argv, default)
+    if config.name is not None:
+        rundir.check_name(config.name)
+    validate(config)
+    return config
+
+
+def explored_run(config: Config) -> Path:
+    """Returns the folder of the exploration run that a config speaks of."""
+    name = config.name or f"{config.preset}-{config.arm}"
+    return (config.source or config.out / name).resolve()
+
+
+def to_json(config: Config) -> dict[str, Any]:
+    """Returns the config as JSON values."""
+
+    def plain(value: Any) -> Any:
+        if dataclasses.is_dataclass(value):
+            return {
+                field.name: plain(getattr(value, field.name))
+                for field in dataclasses.fields(value)
+            }
+        if isinstance(value, tuple):
+            return list(value)
+        return str(value) if isinstance(value, Path) else value
+
+    return plain(config)
+
+
+def from_json(data: dict[str, Any], default: Config) -> Config:
+    """Returns the config that `to_json` wrote; what it lacks is taken from default.
+
+    Raises:
+      CheckpointError: if there is an entry that this version does not know.
+    """
+
+    def fill(data: dict[str, Any], default: Any) -> Any:
+        known = {field.name: getattr(default, field.name) for field in fields(default)}
+        for name in data:
+            if name not in known:
+                raise CheckpointError(f"config.json has an unknown entry {name!r}.")
+        changes = {}
+        for name, value in data.items():
+            if dataclasses.is_dataclass(known[name]):
+                changes[name] = fill(value, known[name])
+            elif name in ("out", "source", "video") and value is not None:
+                changes[name] = Path(value)
+            else:
+                changes[name] = tuple(value) if isinstance(value, list) else value
+        return dataclasses.replace(default, **changes)
+
+    fields = dataclasses.fields
+    return fill(data, default)
+
+
+def differences(
+    old: dict[str, Any], new: dict[str, Any], ignore: Sequence[str]
+) -> list[str]:
+    """Returns what differs between two configs in JSON, as `field: old vs new`."""
+    lines = []
+    for name in sorted({*old, *new} - set(ignore)):
+        before, now = old.get(name), new.get(name)
+        if isinstance(before, dict) and isinstance(now, dict):
+            lines += [f"{name}.{line}" for line in differences(before, now, ())]
+        elif before != now:
+            lines.append(f"{name}: {before} (there) vs {now} (now)")
+    return lines
+
+
+def _first_flags(argv: Sequence[str]) -> argparse.Namespace:
+    """Reads the flags that decide about the defaults of the others."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag, value in (
+        ("--phase", None), ("--preset", "laptop"), ("--arm", "epistemic"),
+        ("--out", "runs"), ("--name", None), ("--from", None),
+    ):  # fmt: skip
+        parser.add_argument(flag, default=value, nargs="?")
+    first, _ = parser.parse_known_args(_joined(argv))
+    if first.preset not in PRESETS:
+        wanted = ", ".join(PRESETS)
+        raise UsageError(f"--preset {first.preset} is not valid; it must be {wanted}.")
+    return first
+
+
+def _joined(argv: Sequence[str]) -> list[str]:
+    """Spells every flag with dashes, as tyro accepts underscores too."""
+
+    def spell(arg: str) -> str:
+        flag, equals, value = arg.partition("=")
+        return flag.replace("_", "-") + equals + value
+
+    return [spell(arg) if arg.startswith("--") else arg for arg in argv]
+
+
+def _explored(first: argparse.Namespace, default: Config) -> Config:
+    """Returns the defaults that an exploration run gives to a later phase."""
+    name = first.name or f"{first.preset}-{first.arm}"
+    folder = Path(getattr(first, "from") or Path(first.out) / name)
+    path = folder / "config.json"
+    if not path.is_file():
+        raise CheckpointError(
+            f"there is no exploration run in {folder}. Run --phase explore first, or "
+            "name a run with --from."
+        )
+    return from_json(rundir.read_json(path), default)
+
+
+def _tyro(argv: Sequence[str], default: Config) -> Config:
+    default = dataclasses.replace(default, phase=tyro.MISSING)
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            return tyro.cli(
+                Config, args=list(argv), default=default, prog="experiments.run"
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise UsageError(_one_line(errors.getvalue())) from None
+
+
+def _one_line(text: str) -> str:
+    """Shortens the boxed message of tyro to its words."""
+    text = text.split("For full helptext")[0].replace("Argument helptext:", "; it is")
+    lines = [line.strip() for line in text.splitlines()]
+    lines = [line for line in lines if line and not re.fullmatch(r"[-─━=╭╮╰╯ ]+", line)]
+    return re.sub(r"\s+", " ", " ".join(lines[1:]) or text).strip()

@@ -1,0 +1,240 @@
+"""Every number of the experiments: the flags, their ranges and the presets."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from experiments.errors import UsageError
+
+Phase = Literal["explore", "zero-shot", "finetune", "report"]
+Preset = Literal["laptop", "paper", "smoke"]
+ArmName = Literal["epistemic", "count", "random", "oracle", "one-step"]
+TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
+
+
+def number(default: Any, low: float, high: float) -> Any:
+    """Returns a dataclass field with a default and the range of valid values."""
+    return dataclasses.field(default=default, metadata={"range": (low, high)})
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelNumbers:
+    """The ensemble."""
+
+    num_members: int = number(5, 1, 100)
+    """Networks in the ensemble."""
+    hidden_size: int = number(200, 1, 8192)
+    """Width of every hidden layer."""
+    num_layers: int = number(4, 1, 16)
+    """Hidden layers."""
+    state_margin: float | None = number(0.5, 0.0, 1e6)
+    """Imagined states may leave the range of the data by this share; None: free."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingNumbers:
+    """Fitting after every trial."""
+
+    num_epochs: int = number(5, 1, 10_000)
+    """Passes over all data."""
+    batch_size: int = number(32, 1, 65_536)
+    """Rows per member and gradient step."""
+    learning_rate: float = number(1e-3, 1e-9, 1.0)
+    """Of Adam."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerNumbers:
+    """The search at every step."""
+
+    optimizer: Literal["cem", "icem", "mppi"] = "cem"
+    """How action sequences are searched."""
+    horizon: int = number(30, 1, 1000)
+    """Steps planned ahead."""
+    num_samples: int = number(500, 2, 1_000_000)
+    """Candidates per iteration."""
+    num_elites: int = number(50, 2, 1_000_000)
+    """Best candidates that shape the next iteration."""
+    num_iterations: int = number(5, 1, 100)
+    """Iterations per step."""
+    num_particles: int = number(20, 1, 100_000)
+    """Particles per candidate, over all members."""
+    momentum: float = number(0.1, 0.0, 1.0)
+    """Share of the old mean and variance that an iteration keeps."""
+    legacy_variance: bool = False
+    """cem: leave the variance without momentum, as PETS's code did in 2018."""
+    noise_beta: float = number(2.0, 0.0, 10.0)
+    """icem: exponent of the coloured noise; 0 is white."""
+    temperature: float = number(1.0, 1e-6, 1e6)
+    """mppi: 0.1 follows the few best candidates, 10 averages over all."""
+    precision: Literal["f32", "tf32", "bf16"] = "bf16"
+    """Of the matrix products while planning; training always uses tf32 or better."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Unsupervised exploration with deep model-based RL on HalfCheetah.
+
+    Phase explore learns a model without a reward, zero-shot uses it for four tasks,
+    finetune goes on learning with their rewards, report makes tables and figures. The
+    same command continues a run that was stopped.
+    """
+
+    phase: Phase
+    """What to do."""
+    preset: Preset = "laptop"
+    """Numbers to start from: minutes on a laptop, the paper's, or seconds."""
+    arm: ArmName = "epistemic"
+    """What exploration seeks: disagreement of the ensemble (SU-PETS), rare states
+    (count), nothing (random), the forward task (oracle), or one-step disagreement."""
+    task: TaskName = "all"
+    """For zero-shot and finetune."""
+    seeds: tuple[int, ...] = (0,)
+    """One run each, side by side in one program; 0 to 2**32 - 1."""
+    out: Path = Path("runs")
+    """Folder of all runs."""
+    name: str | None = None
+    """Name of the exploration run; by default PRESET-ARM."""
+    source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """Exploration run for zero-shot and finetune; by default OUT/NAME."""
+    at_trial: int | None = None
+    """Use the explored model as it was after this trial; by default the last."""
+    video: Path | None = None
+    """Render a trial of each task to this mp4 (zero-shot and finetune)."""
+    num_trials: int = number(60, 1, 100_000)
+    """Exploration trials, the random ones included."""
+    random_trials: int = number(1, 1, 100_000)
+    """Trials with random actions at the start."""
+    trial_length: int = number(1000, 1, 1_000_000)
+    """Environment steps per trial."""
+    eval_trials: int = number(5, 1, 10_000)
+    """zero-shot: trials per task and seed."""
+    finetune_trials: int = number(20, 1, 10_000)
+    """finetune: trials per task and seed."""
+    chunk_length: int = number(50, 1, 1_000_000)
+    """Environment steps per call of the compiled program."""
+    milestones: tuple[int, ...] = (10, 20, 26, 40)
+    """Trials whose checkpoints are kept for good; otherwise the last two are."""
+    num_bits: int = number(32, 1, 32)
+    """count: bits of the hash."""
+    allow_cpu: bool = False
+    """Start on a CPU although it would take over an hour."""
+    debug: bool = False
+    """Show tracebacks."""
+    model: ModelNumbers = ModelNumbers()
+    training: TrainingNumbers = TrainingNumbers()
+    planner: PlannerNumbers = PlannerNumbers()
+
+
+def preset(name: Preset, phase: Any = tyro.MISSING) -> Config:
+    """Returns the numbers of a preset."""
+    if name == "paper":
+        return Config(phase, preset="paper")
+    if name == "laptop":
+        return Config(
+            phase,
+            preset="laptop",
+            num_trials=12,
+            trial_length=500,
+            eval_trials=1,
+            finetune_trials=3,
+            chunk_length=10,
+            training=TrainingNumbers(num_epochs=20, batch_size=64),
+            planner=PlannerNumbers(
+                optimizer="icem",
+                horizon=15,
+                num_samples=64,
+                num_elites=8,
+                num_iterations=3,
+                num_particles=5,
+                precision="f32",
+            ),
+        )
+    return Config(
+        phase,
+        preset="smoke",
+        num_trials=3,
+        trial_length=20,
+        eval_trials=1,
+        finetune_trials=2,
+        chunk_length=10,
+        milestones=(),
+        model=ModelNumbers(num_members=3, hidden_size=16, num_layers=2),
+        training=TrainingNumbers(num_epochs=1, batch_size=16),
+        planner=PlannerNumbers(
+            horizon=3,
+            num_samples=8,
+            num_elites=2,
+            num_iterations=2,
+            num_particles=3,
+            precision="f32",
+        ),
+    )
+
+
+def validate(config: Config) -> None:
+    """Checks all numbers and combinations.
+
+    Raises:
+      UsageError: naming the flag, the value and what would be valid.
+    """
+    _check_ranges(config, "--")
+    planner, model = config.planner, config.model
+    for seed in config.seeds:
+        _require(0 <= seed < 2**32, "--seeds", seed, "0 to 4294967295")
+    unique = 0 < len(config.seeds) == len(set(config.seeds))
+    _require(unique, "--seeds", config.seeds, "one or more different seeds")
+    _require(
+        planner.num_elites <= planner.num_samples or planner.optimizer == "mppi",
+        "--planner.num-elites",
+        planner.num_elites,
+        f"2 to --planner.num-samples ({planner.num_samples})",
+    )
+    _require(
+        planner.num_particles % model.num_members == 0,
+        "--planner.num-particles",
+        planner.num_particles,
+        f"a multiple of --model.num-members ({model.num_members})",
+    )
+    _require(
+        model.num_members >= 2 or config.arm not in ("epistemic", "one-step"),
+        "--model.num-members",
+        model.num_members,
+        f"2 or more for --arm {config.arm}; one member never disagrees",
+    )
+    _require(
+        config.random_trials <= config.num_trials,
+        "--random-trials",
+        config.random_trials,
+        f"1 to --num-trials ({config.num_trials})",
+    )
+    _require(
+        config.trial_length % config.chunk_length == 0,
+        "--chunk-length",
+        config.chunk_length,
+        f"a divisor of --trial-length ({config.trial_length})",
+    )
+    if config.video is not None:
+        good = config.video.suffix == ".mp4" and config.phase in (
+            "zero-shot",
+            "finetune",
+        )
+        _require(good, "--video", config.video, "a .mp4 file, in zero-shot or finetune")
+
+
+def _check_ranges(config: Any, prefix: str) -> None:
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        flag = prefix + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            _check_ranges(value, f"{flag}.")
+        elif "range" in field.metadata and value is not None:
+            low, high = field.metadata["range"]
+            _require(low <= value <= high, flag, value, f"{low:,} to {high:,}")
+
+
+def _require(holds: bool, flag: str, value: Any, valid: str) -> None:
+    if not holds:
+        raise UsageError(f"{flag} {value} is not valid; it must be {valid}.")

@@ -1,0 +1,43 @@
+"""What can end a run, each with the exit code the README promises."""
+
+
+class RunError(Exception):
+    """A failure that is not a bug; its message is one line for the user."""
+
+    exit_code = 1
+
+
+class UsageError(RunError):
+    """A flag or a combination of flags that cannot work."""
+
+    exit_code = 2
+
+
+class CheckpointError(RunError):
+    """A checkpoint that is missing, damaged, incompatible or locked."""
+
+    exit_code = 3
+
+
+class DivergedError(RunError):
+    """A model or a trial that is no longer finite."""
+
+    exit_code = 4
+
+
+class StorageError(RunError):
+    """A disk that is full, read-only or not there."""
+
+    exit_code = 5
+
+
+class OutOfMemoryError(RunError):
+    """A plan too large for the device."""
+
+    exit_code = 6
+
+
+class InterruptedRun(RunError):
+    """A signal; the same command goes on from the last checkpoint."""
+
+    exit_code = 75

@@ -1,0 +1,185 @@
+"""Figures of the report: colour-blind-safe, every seed thin, the mean bold."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+# Okabe and Ito's palette; an arm has the same colour in every figure.
+_COLORS = {
+    "epistemic": "#0072B2",
+    "best": "#000000",
+    "count": "#E69F00",
+    "count-16": "#D55E00",
+    "count-32": "#E69F00",
+    "random": "#7F7F7F",
+    "oracle": "#009E73",
+    "one-step": "#CC79A7",
+}
+_OTHER_COLORS = ("#56B4E9", "#8C564B")
+_STYLE: Any = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "font.size": 9,
+    "grid.color": "#E5E5E5",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "savefig.dpi": 150,
+}
+_LOG_RATIO = 1000.0  # a range that a linear axis would hide
+
+
+class Curve(NamedTuple):
+    """One arm over trials; NaN where a seed has no finite number."""
+
+    trials: np.ndarray  # [N]
+    values: np.ndarray  # [S, N]
+
+
+Curves = Mapping[str, Curve]  # by arm
+
+
+class TaskPanels(NamedTuple):
+    """Figure 4's two panels of one task."""
+
+    exploring: Curves  # the task's return while nobody sought it
+    tuning: Curves  # zero-shot score at `explored` trials, then fine-tuning
+    jump_start: Mapping[str, np.ndarray]  # [S], the zero-shot scores of all seeds
+
+
+def figure_4(target: Path, panels: Mapping[str, TaskPanels], explored: int) -> None:
+    """Draws exploration (left) and the task's reward (right), a row per task."""
+    sides = [side for panel in panels.values() for side in panel]
+    arms = list(dict.fromkeys(arm for side in sides for arm in side))
+    with mpl.rc_context(_STYLE):
+        figure = _figure(9.0, 2.3 * len(panels) + 0.9)
+        grid = figure.subplots(
+            len(panels), 2, squeeze=False, sharex="col", sharey="row",
+            width_ratios=[1.6, 1.0],
+        )  # fmt: skip
+        for row, (task, panel) in zip(grid, panels.items(), strict=True):
+            _draw(row[0], panel.exploring, arms)
+            _draw(row[1], panel.tuning, arms)
+            for arm, scores in panel.jump_start.items():
+                _mark_start(row[1], explored, scores, color(arm, arms))
+            row[0].set_ylabel(f"{task}\nreturn of a trial")
+        grid[0, 0].set_title("exploring")
+        grid[0, 1].set_title(f"the task's reward given after {explored} trials")
+        for axes in grid[-1]:
+            axes.set_xlabel("trial")
+        _legend(figure, arms)
+        _save(figure, target)
+
+
+def exploration(target: Path, value: Curves, turns: Curves) -> None:
+    """Draws what each arm's plans were worth to it and how often the robot turned.
+
+    Arms value different things, so each has its own axis; turns are shared.
+    """
+    arms = list(dict.fromkeys([*value, *turns]))
+    with mpl.rc_context(_STYLE):
+        figure = _figure(max(2.6 * len(arms), 5.0), 4.6)
+        grid = figure.subplots(2, len(arms), squeeze=False, sharex=True)
+        for column, arm in enumerate(arms):
+            above, below = grid[:, column]
+            above.set_title(arm)
+            for axes, curves in ((above, value), (below, turns)):
+                if arm in curves:
+                    _draw(axes, {arm: curves[arm]}, arms, running_max=False)
+                else:
+                    axes.set_yticks([])
+                    axes.text(0.5, 0.5, "no number logged", color="#7F7F7F",
+                              transform=axes.transAxes, ha="center")  # fmt: skip
+            _log_if_wide(above, value.get(arm))
+            below.set_xlabel("trial")
+            if column:
+                below.sharey(grid[1, 0])
+        grid[0, 0].set_ylabel("exploration value\nper imagined step")
+        grid[1, 0].set_ylabel("turns of the pitch\nin a trial")
+        _save(figure, target)
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, target: Path) -> None:
+    # Without the version of matplotlib, equal logs give equal files.
+    figure.savefig(target, metadata={"Software": None})
+
+
+def color(arm: str, arms: Sequence[str]) -> str:
+    """Returns an arm's colour; arms without their own share two more in turn."""
+    unknown = [name for name in arms if name not in _COLORS]
+    if arm in _COLORS:
+        return _COLORS[arm]
+    return _OTHER_COLORS[unknown.index(arm) % len(_OTHER_COLORS)]
+
+
+def _draw(
+    axes: Any, curves: Curves, arms: Sequence[str], *, running_max: bool = True
+) -> None:  # fmt: skip
+    axes.grid(axis="y")
+    axes.set_axisbelow(True)
+    axes.axhline(0.0, color="#BFBFBF", linewidth=0.8, zorder=1)
+    for arm, (trials, values) in curves.items():
+        paint = color(arm, arms)
+        # A mean over fewer seeds would jump where one of them ends.
+        mean = values.mean(axis=0)
+        if len(values) > 1:
+            axes.plot(trials, values.T, color=paint, linewidth=0.6, alpha=0.45)
+        single = len(trials) < 3 or _isolated(mean)
+        axes.plot(
+            trials, mean, color=paint, linewidth=2.0, zorder=3,
+            marker="o" if single else None, markersize=3.5,
+        )  # fmt: skip
+        if running_max:
+            best = np.fmax.accumulate(values, axis=1).mean(axis=0)
+            axes.plot(trials, best, color=paint, linewidth=1.0, linestyle=":")
+
+
+def _isolated(mean: np.ndarray) -> bool:
+    """Says whether a number has no finite neighbour to draw a line to."""
+    finite = np.isfinite(mean)
+    near = np.r_[False, finite[:-1]] | np.r_[finite[1:], False]
+    return bool((finite & ~near).any())
+
+
+def _mark_start(axes: Any, trial: int, scores: np.ndarray, paint: str) -> None:
+    """Marks the jump-start: each seed small, the mean large."""
+    finite = scores[np.isfinite(scores)]
+    if len(finite) > 1:
+        axes.plot(
+            np.full(len(finite), trial), finite, "o", color=paint, markersize=3,
+            alpha=0.5, linewidth=0,
+        )  # fmt: skip
+    if len(finite):
+        axes.plot(
+            trial, finite.mean(), "o", color=paint, markeredgecolor="white",
+            markersize=7, zorder=4,
+        )  # fmt: skip
+
+
+def _log_if_wide(axes: Any, curve: Curve | None) -> None:
+    if curve is None:
+        return
+    finite = curve.values[np.isfinite(curve.values) & (curve.values != 0)]
+    if len(finite) and finite.min() > 0 and finite.max() / finite.min() > _LOG_RATIO:
+        axes.set_yscale("log")
+
+
+def _legend(figure: Figure, arms: Sequence[str]) -> None:
+    lines = [Line2D([], [], color=color(arm, arms), linewidth=2.0) for arm in arms]
+    lines.append(Line2D([], [], color="#404040", linewidth=0.6, alpha=0.6))
+    lines.append(Line2D([], [], color="#404040", linewidth=1.0, linestyle=":"))
+    labels = [*arms, "one seed", "best so far"]
+    figure.legend(lines, labels, loc="outside upper center", ncols=min(len(lines), 8))

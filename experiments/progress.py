@@ -1,0 +1,77 @@
+"""What a person watching sees, and how they stop a run."""
+
+import contextlib
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+import tqdm
+
+from experiments.errors import InterruptedRun
+
+# A log file gets a line per trial, no bar.
+_BAR = (
+    "{desc} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} steps "
+    "[{elapsed} < {remaining}, {rate_fmt}]"
+)
+
+
+class Progress:
+    """A bar over environment steps, lines per trial, and the wish to stop."""
+
+    def __init__(self, total: int, done: int, what: str) -> None:
+        self._bar = tqdm.tqdm(
+            total=total,
+            initial=done,
+            desc=what,
+            unit=" steps",
+            bar_format=_BAR,
+            disable=not sys.stderr.isatty(),
+            dynamic_ncols=True,
+            smoothing=0.1,
+        )
+        self._what = what
+        self._start = time.monotonic()
+        self._first, self._total, self._done = done, total, done
+        self._stop: str | None = None
+
+    def tick(self, steps: int) -> None:
+        """Counts steps of one environment; raises InterruptedRun after a signal."""
+        self._done += steps
+        self._bar.update(steps)
+        if self._stop is not None:
+            raise InterruptedRun(self._stop)
+
+    def line(self, text: str) -> None:
+        """Prints a line above the bar, with the time left where no bar shows it."""
+        if not sys.stderr.isatty():
+            elapsed = time.monotonic() - self._start
+            rate = (self._done - self._first) / max(elapsed, 1e-9)
+            left = (self._total - self._done) / max(rate, 1e-9)
+            text = f"{text}  [{rate:.1f} steps/s, {left / 60:.1f} min left]"
+        tqdm.tqdm.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+    @contextlib.contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Turns the first SIGINT or SIGTERM into a stop at the next tick.
+
+        A second signal ends the process at once, as if nothing were caught.
+        """
+
+        def request(number: int, frame: FrameType | None) -> None:
+            del frame
+            self._stop = signal.Signals(number).name
+            for name in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(name, signal.SIG_DFL)
+
+        names = (signal.SIGINT, signal.SIGTERM)
+        before = [signal.signal(name, request) for name in names]
+        try:
+            yield
+        finally:
+            for name, handler in zip(names, before, strict=True):
+                signal.signal(name, handler)
+            self._bar.close()

@@ -1,0 +1,166 @@
+"""`python -m experiments.run --phase {explore,zero-shot,finetune,report}`."""
+
+import os
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from experiments import cli, session
+from experiments.config import Config
+from experiments.errors import (
+    CheckpointError,
+    InterruptedRun,
+    OutOfMemoryError,
+    RunError,
+    StorageError,
+    UsageError,
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one phase and returns the exit code.
+
+    0 done, 1 a bug, 2 usage, 3 checkpoint, 4 diverged, 5 storage, 6 out of memory,
+    75 interrupted and resumable.
+    """
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    try:
+        config = cli.parse(arguments)
+        with _plain_errors(config):
+            _dispatch(config)
+    except RunError as error:
+        if "--debug" in arguments:
+            traceback.print_exc()
+        kind = "stopped" if isinstance(error, InterruptedRun) else "error"
+        print(f"{kind}: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def _dispatch(config: Config) -> None:
+    if config.phase == "report":
+        from experiments import report
+
+        for path in report.write_report(config.out, config.out / "report"):
+            _say(f"wrote {path}")
+        return
+    # The library logs what a user cannot act on.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    source = cli.explored_run(config)
+    if config.phase == "explore":
+        _explore(config, source)
+        return
+    step = _explored_step(config, source)
+    folder = source / f"{config.phase}-{step:03d}"
+    if config.task != "all":
+        folder = folder.with_name(f"{folder.name}-{config.task}")
+    from experiments import phases
+
+    phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
+    with session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say):
+        phase(config, source, folder, step, _say)
+    if config.video is not None:
+        _video(config, folder)
+
+
+def _explore(config: Config, folder: Path) -> None:
+    _check_cpu(config)
+    from experiments import phases
+
+    with session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say):
+        phases.explore(config, folder, _say)
+    flags = f"--from {config.source}" if config.source else ""
+    flags = flags or f"--preset {config.preset} --arm {config.arm}"
+    _say(f"next: python -m experiments.run --phase zero-shot {flags}")
+
+
+def _explored_step(config: Config, source: Path) -> int:
+    """Returns the trial whose checkpoint phase 2 starts from."""
+    from experiments import checkpoint
+
+    steps = checkpoint.steps(source / "checkpoints")
+    if not steps:
+        raise CheckpointError(f"there is no checkpoint in {source}.")
+    step = config.at_trial if config.at_trial is not None else steps[-1]
+    if step not in steps:
+        kept = ", ".join(map(str, steps))
+        raise UsageError(f"--at-trial {step} is not valid; it must be one of {kept}.")
+    return step
+
+
+def _video(config: Config, folder: Path) -> None:
+    """Renders the first trial of each task; failing at it does not fail the run."""
+    from experiments import video
+    from jaxpets.envs.half_cheetah import TASK_NAMES
+
+    assert config.video is not None
+    names = TASK_NAMES if config.task == "all" else (config.task,)
+    for name in names:
+        target = config.video
+        if len(names) > 1:
+            target = target.with_stem(f"{target.stem}-{name}")
+        video.render(
+            folder / "trajectories.npz",
+            target,
+            task=name,
+            seed=config.seeds[0],
+            trial=1,
+        )
+        _say(f"wrote {target}")
+
+
+def _check_cpu(config: Config) -> None:
+    """Refuses what would take over an hour on a CPU by mistake."""
+    import jax
+
+    if jax.default_backend() != "cpu" or config.allow_cpu or config.arm == "random":
+        return
+    planner, model = config.planner, config.model
+    width = model.hidden_size
+    products = 24 * width + (model.num_layers - 1) * width**2 + width * 36
+    rows = planner.num_samples * planner.num_particles * planner.num_iterations
+    steps = (config.num_trials - config.random_trials) * config.trial_length
+    hours = (
+        2 * products * rows * planner.horizon * steps * len(config.seeds) / 1e11 / 3600
+    )
+    if hours > 1:
+        raise UsageError(
+            f"--preset {config.preset} would take about {hours:.0f} hours on this CPU; "
+            "use a GPU, a smaller preset or --allow-cpu."
+        )
+
+
+@contextmanager
+def _plain_errors(config: Config) -> Iterator[None]:
+    """Turns what the system says about memory and disk into one line."""
+    try:
+        yield
+    except MemoryError as error:
+        raise OutOfMemoryError(_memory_advice(config)) from error
+    except OSError as error:
+        raise StorageError(f"{error.strerror} ({error.filename}).") from error
+    except RuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise OutOfMemoryError(_memory_advice(config)) from error
+
+
+def _memory_advice(config: Config) -> str:
+    planner = config.planner
+    trials = config.eval_trials if config.phase == "zero-shot" else 1
+    return (
+        f"out of memory. {len(config.seeds)} seeds x {trials} trials x "
+        f"{planner.num_samples} samples x {planner.num_particles} particles x horizon "
+        f"{planner.horizon} are planned at once; lower one of --seeds, --eval-trials, "
+        "--planner.num-samples, --planner.num-particles. The last checkpoint is intact."
+    )
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""Settings of the whole suite: CPU, strict promotion, a scratch working directory."""
+
+import atexit
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+# Before jax is imported. For the tests marked gpu: JAX_PLATFORMS=cuda,cpu.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import pytest
+
+# Strict promotion finds every place where the library leans on implicit casts.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Tests that trace the same program anew share its compilation. The directory is private
+# and lives as long as the run; JAX_COMPILATION_CACHE_DIR names one that stays.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _cache = tempfile.mkdtemp(prefix="jaxpets-tests-")
+    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    jax.config.update("jax_compilation_cache_dir", _cache)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+# Last on the path, so that an installed wheel is what gets tested; the experiments
+# and benchmarks are not in the wheel.
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skips what needs a GPU where there is none."""
+    if any(device.platform == "gpu" for device in jax.devices()):
+        return
+    skip = pytest.mark.skip(reason="needs a GPU")
+    for item in items:
+        if "gpu" in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _working_directory(tmp_path_factory):
+    """MuJoCo's C code writes MUJOCO_LOG.TXT where it stands: not in the repository."""
+    before = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("cwd"))
+    yield
+    os.chdir(before)
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    """A typed key."""
+    return jax.random.key(0)

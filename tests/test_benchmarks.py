@@ -1,0 +1,223 @@
+"""The benchmarks run at toy sizes, wait for their results and report whole rows."""
+
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import all as all_benchmarks
+from benchmarks import (
+    env,
+    fit,
+    model_quality,
+    plan,
+    real_data,
+    rollout,
+    timing,
+    trial,
+    workloads,
+)
+from benchmarks import rows as rows_module
+
+ENVIRONMENT = {"benchmark", "date", "device", "cpus", "versions", "sizes"}
+TIMING = {"compile_s", "min_ms", "median_ms", "repeats"}
+
+
+def check_rows(found, path, results):
+    """Rows are complete, positive, and the same in the file."""
+    written = [json.loads(line) for line in path.read_text().splitlines()]
+    assert json.loads(json.dumps(found)) == written[-len(found) :]
+    for row in found:
+        assert set(row) == ENVIRONMENT | TIMING | set(results)
+        assert row["device"] == jax.devices()[0].device_kind
+        assert row["versions"]["jax"] == jax.__version__
+        assert 0 < row["min_ms"] <= row["median_ms"]
+        assert all(row[name] > 0 for name in results)
+
+
+class Late:
+    """A result that arrives 20 ms after one begins to wait for it."""
+
+    waits = 0
+
+    def block_until_ready(self):
+        Late.waits += 1
+        time.sleep(0.02)
+        return self
+
+
+def test_a_run_ends_when_its_results_are_there():
+    assert timing.seconds(lambda: {"nested": (Late(),)}) >= 0.02
+
+
+def test_compare_runs_both_in_turn_and_waits_for_both():
+    order = []
+    Late.waits = 0
+    result = timing.compare(
+        lambda: [order.append("first"), Late(), Late()],
+        lambda: [order.append("second"), Late()],
+        repeats=3,
+    )
+    assert order == ["first", "second"] * 4  # once unmeasured
+    assert Late.waits == 12
+    assert result.first_ms >= 40 and result.second_ms >= 20 and result.ratio > 1
+    assert result.repeats == 3
+
+
+def test_measure_compiles_once_and_counts_repeats():
+    traces = []
+
+    def function(x):
+        traces.append(x.shape)
+        return jnp.sin(x)
+
+    result = timing.measure(function, jnp.ones(4), repeats=5)
+    assert traces == [(4,)]
+    assert result.repeats == 5 and result.compile_s > 0
+    assert 0 < result.min_ms <= result.median_ms
+
+
+def test_summary_is_the_minimum_and_the_median():
+    result = timing.summarize([0.003, 0.001, 0.009], compile_s=2.0)
+    assert result == timing.Timing(2.0, 1.0, 3.0, 3)
+
+
+def test_work_of_the_paper_is_what_is_published():
+    size = workloads.SIZES["paper"]
+    candidates = workloads.candidates_per_action(size, "cem")
+    assert candidates == 2500
+    assert workloads.rollout_flops(size, candidates) == 396e9
+    # iCEM: 500, 400, 320, 256, 204, with 15 elites kept in each and the last mean.
+    assert workloads.candidates_per_action(size, "icem") == 1680 + 5 * 15 + 1
+
+
+def test_plan_over_seeds_and_samples(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    results = {"ms_per_seed", "gflop", "tflops_per_s"}
+    common = ["--tiny", "--repeats", "2", "--json", str(path)]
+    found = plan.main(["--seeds", "1", "2", *common])
+    check_rows(found, path, results)
+    assert [row["sizes"]["seeds"] for row in found] == [1, 2]
+    assert found[1]["gflop"] == 2 * found[0]["gflop"]
+    flags = "--seeds 1 --num-samples 8 --horizon 2 --optimizer icem --reward task"
+    found = plan.main([*flags.split(), "--precision", "f32", *common])
+    check_rows(found, path, results)
+    wanted = {"num_samples": 8, "horizon": 2, "optimizer": "icem", "precision": "f32"}
+    assert found[0]["sizes"].items() >= wanted.items()
+
+
+def test_rollout_and_fit(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    common = ["--tiny", "--repeats", "2", "--json", str(path)]
+    found = rollout.main(["--precision", "f32", *common])
+    check_rows(found, path, {"us_per_step", "tflops_per_s"})
+    found = fit.main(["--seeds", "2", "--epochs", "2", *common])
+    check_rows(found, path, {"us_per_update"})
+    assert found[0]["sizes"]["updates"] == 2 * 4  # 100 rows, the last batch partial
+
+
+def test_env_and_trial(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    common = ["--tiny", "--repeats", "2", "--json", str(path)]
+    found = env.main(common)
+    assert [row["sizes"]["engine"] for row in found] == ["mjx", "mujoco"]
+    check_rows(found, path, {"ms_per_step", "env_steps_per_s"})
+    found = trial.main(common)
+    check_rows(found, path, {"unroll_s", "ms_per_step", "fit_s", "trial_s"})
+    row = found[0]
+    assert row["trial_s"] == pytest.approx(row["unroll_s"] + row["fit_s"])
+
+
+def test_the_set_for_a_gpu_is_made_of_valid_flags(monkeypatch, tmp_path):
+    seen = []
+
+    def record(run_args, columns, path):
+        del run_args, columns
+        seen.append(path)
+        return []
+
+    # Flags are parsed by the real programs; only the measuring is left out.
+    monkeypatch.setattr(rows_module, "report", record)
+    path = tmp_path / "rows.jsonl"
+    assert all_benchmarks.main(["--tiny", "--json", str(path)]) == []
+    assert seen == [path] * len(all_benchmarks.SET)
+
+
+def test_a_row_is_on_disk_before_the_next_is_measured(tmp_path):
+    path = tmp_path / "rows.jsonl"
+
+    def measured():
+        yield rows_module.make_row("first", {})
+        assert len(path.read_text().splitlines()) == 1
+        yield rows_module.make_row("second", {})
+
+    assert len(rows_module.report(measured(), (), path)) == 2
+
+
+def test_scores_equal_closed_forms():
+    target = np.array([[0.0, 2.0], [2.0, 6.0]])
+    same = model_quality.scores(
+        np.stack([target + 1.0] * 3), np.full((3, 2, 2), 4.0), target
+    )
+    expected = 0.5 * (1 / 4 + np.log(2 * np.pi * 4))
+    assert same["nll_members"] == pytest.approx(expected)
+    assert same["nll_mixture"] == pytest.approx(expected)  # equal members
+    assert same["nrmse"] == pytest.approx(np.sqrt((1 + 1 / 4) / 2))  # stds 1 and 2
+    one_right = np.stack([target, target + 1e3])
+    mixed = model_quality.scores(one_right, np.ones((2, 2, 2)), target)
+    # One member of two explains everything: log 2 over two dimensions.
+    assert mixed["nll_mixture"] == pytest.approx(
+        0.5 * np.log(2 * np.pi) + np.log(2) / 2
+    )
+
+
+def test_model_quality_of_ours_on_real_transitions(tmp_path):
+    path, data = tmp_path / "rows.jsonl", tmp_path / "data.npz"
+    flags = f"--tiny --ours --seeds 0 --epochs 1 --data {data} --json {path}"
+    found = model_quality.main(flags.split())
+    again = model_quality.main(flags.split())
+    assert found[0]["nrmse"] == again[0]["nrmse"]  # the file has all the data
+    results = {"nll_members", "nll_mixture", "nrmse", "us_per_update"}
+    assert set(found[0]) == ENVIRONMENT | results
+    assert all(np.isfinite(found[0][name]) for name in results)
+
+    split = real_data.load(data)
+    obs, next_obs = split.train["obs"], split.train["next_obs"]
+    np.testing.assert_array_equal(obs[1:], next_obs[:-1])
+    np.testing.assert_allclose(obs[0], 0.0, atol=0.006)
+    # The first entry is a mean velocity: between those at the ends, but for impacts.
+    mean = (obs[:, 9] + next_obs[:, 9]) / 2
+    assert np.corrcoef(next_obs[:, 0], mean)[0, 1] > 0.9
+
+
+def test_preprocessing_for_mbrl_lib_is_ours():
+    from jaxpets.envs import half_cheetah
+
+    key = jax.random.key(0)
+    drawn = workloads.transitions(key, 7)
+    arrays = {name: np.asarray(x) for name, x in drawn._asdict().items()}
+    space = half_cheetah.model_space()
+    np.testing.assert_allclose(
+        real_data.features(arrays["obs"]), space.features(drawn.obs), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        real_data.targets(arrays),
+        space.target(drawn.obs, drawn.next_obs),
+        rtol=1e-5,
+        atol=1e-5,
+    )
+
+
+def test_bad_usage(capsys):
+    for program, flags, message in [
+        (plan, "--seeds 0", "must be at least 1"),
+        (plan, "--precision f16", "invalid choice"),
+        (model_quality, "--tiny", "ask for --ours, --mbrl or both"),
+    ]:
+        with pytest.raises(SystemExit) as caught:
+            program.main(flags.split())
+        assert caught.value.code == 2
+        assert message in capsys.readouterr().err

@@ -1,0 +1,124 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxpets._src import checks
+
+
+@pytest.mark.parametrize("value", [1, 7, np.int32(3)])
+def test_count_takes_integers(value):
+    checks.check_count("num", value)
+
+
+@pytest.mark.parametrize("value", [True, 2.0, "3", None, jnp.int32(3)])
+def test_count_refuses_what_is_no_python_integer(value):
+    with pytest.raises(TypeError, match="num_samples must be a Python int, got"):
+        checks.check_count("num_samples", value)
+
+
+def test_count_names_argument_minimum_and_value():
+    with pytest.raises(ValueError, match="num_elites must be at least 2, got 1"):
+        checks.check_count("num_elites", 1, minimum=2)
+
+
+@pytest.mark.parametrize("value", [0.0, 1, 0.5, np.float32(0.25)])
+def test_real_takes_numbers_in_range(value):
+    checks.check_real("momentum", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan"), float("inf")])
+def test_real_refuses_what_is_out_of_range(value):
+    with pytest.raises(ValueError, match=r"momentum must be in \[0, 1\], got"):
+        checks.check_real("momentum", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [True, "0.5", None])
+def test_real_refuses_other_types(value):
+    with pytest.raises(TypeError, match="momentum must be a Python float, got"):
+        checks.check_real("momentum", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "wanted"),
+    [
+        ((3,), ["D"]),
+        ((3,), [3]),
+        ((2, 3), [None, 3]),
+        ((3,), ["...", 3]),
+        ((4, 5, 3), ["...", 3]),
+        ((), []),
+    ],
+)
+def test_array_takes_fitting_shapes(shape, wanted):
+    checks.check_array("obs", jnp.zeros(shape, jnp.float32), wanted)
+
+
+@pytest.mark.parametrize(
+    ("shape", "wanted", "text"),
+    [
+        ((3,), [2], r"obs must be float32\[2\], got float32\[3\]"),
+        ((3,), ["B", 3], r"obs must be float32\[B, 3\], got float32\[3\]"),
+        ((2, 4), ["...", 3], r"obs must be float32\[\.\.\., 3\], got float32\[2, 4\]"),
+        ((), ["...", 3], r"obs must be float32\[\.\.\., 3\], got float32\[\]"),
+        ((1,), [None, 1], r"obs must be float32\[\?, 1\], got float32\[1\]"),
+    ],
+)
+def test_array_says_what_was_wanted_and_what_came(shape, wanted, text):
+    with pytest.raises(ValueError, match=text):
+        checks.check_array("obs", jnp.zeros(shape, jnp.float32), wanted)
+
+
+@pytest.mark.parametrize("dtype", [jnp.int32, jnp.bfloat16, jnp.bool_])
+def test_array_refuses_other_dtypes(dtype):
+    name = jnp.dtype(dtype).name
+    with pytest.raises(ValueError, match=rf"obs must be float32\[D\], got {name}\[3\]"):
+        checks.check_array("obs", jnp.zeros(3, dtype), ["D"])
+
+
+@pytest.mark.parametrize("value", [[1.0], None, "box"])
+def test_array_names_the_argument_when_no_array_came(value):
+    with pytest.raises((TypeError, ValueError), match="action_low must be float32"):
+        checks.check_array("action_low", value, ["A"])
+
+
+BAD_BOXES = {
+    "crossed": ([1.0], [-1.0]),
+    "flat": ([1.0], [1.0]),
+    "infinite": ([-np.inf], [1.0]),
+    "nan": ([np.nan], [1.0]),
+    "widths": ([-1.0, -1.0], [1.0]),
+    "scalar": (-1.0, 1.0),
+    "empty": ([], []),
+}
+
+
+@pytest.mark.parametrize("name", BAD_BOXES)
+def test_action_box_refuses_what_cannot_be_searched(name):
+    low, high = (jnp.asarray(bound, jnp.float32) for bound in BAD_BOXES[name])
+    with pytest.raises(ValueError, match=r"action_(low|high)"):
+        checks.check_action_box(low, high)
+
+
+def test_action_box_looks_at_no_traced_value():
+    def build(low):
+        checks.check_action_box(low, -low)
+        return low
+
+    jax.jit(build)(jnp.ones(2))  # crossed, but that is not known while tracing
+
+
+def test_key_takes_one_typed_key():
+    checks.check_key("key", jax.random.key(0))
+    jax.jit(lambda key: checks.check_key("key", key))(jax.random.key(0))
+
+
+@pytest.mark.parametrize("key", [jax.random.PRNGKey(0), 0, None])
+def test_key_refuses_raw_keys(key):
+    with pytest.raises(TypeError, match=r"plan_key must be a typed key .* got"):
+        checks.check_key("plan_key", key)
+
+
+def test_key_refuses_a_batch():
+    keys = jax.random.split(jax.random.key(0), 3)
+    with pytest.raises(ValueError, match=r"key must be a single key.*\(3,\).*vmap"):
+        checks.check_key("key", keys)

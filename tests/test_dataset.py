@@ -1,0 +1,97 @@
+import collections
+
+import jax
+import jax.numpy as jnp
+import jaxpets
+import numpy as np
+import pytest
+import toys
+from jaxpets import Transition
+
+CAPACITY = 8
+
+
+def numbered(first, length):
+    """Rows that say when they came."""
+    count = jnp.arange(first, first + length, dtype=jnp.float32)[:, None]
+    return Transition(jnp.tile(count, (1, 2)), -count, jnp.tile(count + 0.5, (1, 2)))
+
+
+def held(dataset):
+    """The valid rows' numbers, sorted."""
+    size = int(dataset.size)
+    obs = np.asarray(dataset.data.obs[:size, 0])
+    np.testing.assert_array_equal(dataset.data.action[:size, 0], -obs)
+    np.testing.assert_array_equal(dataset.data.next_obs[:size, 1], obs + 0.5)
+    return sorted(obs.tolist())
+
+
+def test_starts_empty():
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    assert dataset.size == 0 and dataset.size.dtype == jnp.int32
+    assert dataset.data.obs.shape == (CAPACITY, 2)
+    assert dataset.data.action.shape == (CAPACITY, 1)
+
+
+@pytest.mark.parametrize(
+    "lengths", [[8], [3, 5], [3, 5, 1], [8, 1], [5, 5], [7, 8, 8], [1] * 19]
+)
+def test_keeps_the_newest_rows(lengths):
+    """At capacity, one past it, and round and round, as a bounded queue."""
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    queue = collections.deque(maxlen=CAPACITY)
+    first = 0
+    for length in lengths:
+        dataset = jaxpets.append(dataset, numbered(first, length))
+        queue.extend(range(first, first + length))
+        first += length
+        assert int(dataset.size) == len(queue)
+        assert held(dataset) == sorted(queue)
+
+
+def test_one_trace_while_it_grows():
+    append = jax.jit(jaxpets.append)
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    want = toys.avals(dataset)
+    for first in range(0, 20, 4):
+        dataset = append(dataset, numbered(first, 4))
+        assert toys.avals(dataset) == want
+    assert append._cache_size() == 1
+
+
+def test_eager_append_keeps_the_avals():
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    assert toys.avals(jaxpets.append(dataset, numbered(0, 3))) == toys.avals(dataset)
+
+
+def test_too_many_rows_fail():
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    with pytest.raises(ValueError, match="capacity of 8, got 9 rows"):
+        jaxpets.append(dataset, numbered(0, 9))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [
+        ("obs", jnp.zeros((3, 4)), r"float32\[3, 2\], got float32\[3, 4\]"),
+        ("action", jnp.zeros((2, 1)), r"float32\[3, 1\], got float32\[2, 1\]"),
+        ("next_obs", jnp.zeros((3, 2), jnp.int32), r"float32\[3, 2\], got int32"),
+        ("obs", jnp.zeros(2), r"float32\[.*\], got float32\[2\]"),
+        ("obs", jnp.float32(0), r"float32\[.*\], got float32\[\]"),
+    ],
+)
+def test_rows_that_do_not_fit_fail(name, value, wanted):
+    rows = numbered(0, 3)._replace(**{name: value})
+    with pytest.raises(ValueError, match=rf"transitions\.{name} must be {wanted}"):
+        jaxpets.append(jaxpets.init_dataset(CAPACITY, 2, 1), rows)
+
+
+@pytest.mark.parametrize("sizes", [(0, 2, 1), (8, 0, 1), (8, 2, 0)])
+def test_sizes_are_positive(sizes):
+    with pytest.raises(ValueError, match="must be at least 1, got 0"):
+        jaxpets.init_dataset(*sizes)
+
+
+def test_sizes_are_integers():
+    with pytest.raises(TypeError, match="capacity must be a Python int"):
+        jaxpets.init_dataset(1e4, 2, 1)

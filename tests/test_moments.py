@@ -1,0 +1,33 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import reference
+from jaxpets._src.moments import moments
+
+
+def test_equal_the_reference_on_the_first_rows():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(3.0, [0.1, 1.0, 50.0], size=(200, 3))
+    rows[:, 1] = 0.25  # constant, and exact in float32
+    padded = np.concatenate([rows, np.full((56, 3), np.nan)])
+    mean, std = moments(jnp.asarray(padded, jnp.float32), jnp.int32(200))
+    want_mean, want_std = reference.input_scaler(rows)
+    # float32 sums of 200 rows against float64.
+    np.testing.assert_allclose(mean, want_mean, rtol=1e-5)
+    np.testing.assert_allclose(std, want_std, rtol=1e-5)
+    assert std[1] == 1.0
+
+
+def test_no_rows_give_the_identity():
+    mean, std = moments(jnp.full((4, 2), jnp.nan, jnp.float32), jnp.int32(0))
+    np.testing.assert_array_equal(mean, 0.0)
+    np.testing.assert_array_equal(std, 1.0)
+
+
+def test_size_is_traced():
+    rows = jnp.arange(12.0).reshape(6, 2)
+    jitted = jax.jit(moments)
+    for size in (1, 3, 6):
+        mean, _ = jitted(rows, jnp.int32(size))
+        np.testing.assert_allclose(mean, rows[:size].mean(0), rtol=1e-6)
+    assert jitted._cache_size() == 1

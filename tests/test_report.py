@@ -1,0 +1,336 @@
+"""The report, from small logs whose every number is known."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
+from experiments import stats
+from experiments.errors import UsageError
+from experiments.report import load, write_report
+from jaxpets.envs.half_cheetah import TASK_NAMES
+
+EXPLORED = 3
+# Zero-shot scores by seed; a task adds 10 times its place.
+SCORES = {"epistemic": [400.0, 500.0, 900.0], "count": [100.0, 200.0, 150.0]}
+
+
+def write_run(folder, rows, **config):
+    folder.mkdir(parents=True)
+    config = {"preset": "laptop", "trial_length": 10, "num_bits": 16, **config}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "env.json").write_text(
+        json.dumps({"jax": "9.9", "device_kind": "abacus"})
+    )
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    (folder / "metrics.jsonl").write_text(text)
+
+
+def explore_rows(arm, seeds):
+    return [
+        {
+            "phase": "explore",
+            "arm": arm,
+            "seed": seed,
+            "trial": trial,
+            "steps": 10 * trial,
+            "planner": "random" if trial == 1 else "plan",
+            "returns": {name: -float(trial + seed) for name in TASK_NAMES},
+            "value": None if arm == "random" else 3.0 + trial,
+            "turns": 0.5 * trial,
+            "seconds": {"act": 2.0 + trial, "fit": 1.0},
+        }
+        for trial in range(1, EXPLORED + 1)
+        for seed in seeds
+    ]
+
+
+def zero_shot_rows(arm, scores, explored=EXPLORED):
+    """Two trials a seed, 7 above and below the score."""
+    return [
+        {
+            "phase": "zero-shot",
+            "arm": arm,
+            "seed": seed,
+            "task": task,
+            "trial": trial,
+            "explored_trials": explored,
+            "return": score + 10.0 * i + (7.0 if trial == 1 else -7.0),
+        }
+        for seed, score in enumerate(scores)
+        for i, task in enumerate(TASK_NAMES)
+        for trial in (1, 2)
+    ]
+
+
+def finetune_rows(arm, seeds):
+    return [
+        {
+            "phase": "finetune",
+            "arm": arm,
+            "seed": seed,
+            "task": task,
+            "trial": EXPLORED + k,
+            "explored_trials": EXPLORED,
+            "return": 1000.0 * k + seed,
+        }
+        for seed in seeds
+        for task in TASK_NAMES
+        for k in (1, 2)
+    ]
+
+
+def write_arm(out, arm, scores, **config):
+    run = out / f"{config.get('preset', 'laptop')}-{arm}"
+    common = {"arm": arm, "num_trials": EXPLORED, **config}
+    seeds = range(len(scores))
+    write_run(run, explore_rows(arm, seeds), phase="explore", **common)
+    zero_shot = run / f"zero-shot-{EXPLORED:03d}"
+    write_run(zero_shot, zero_shot_rows(arm, scores), phase="zero-shot", **common)
+    return run
+
+
+@pytest.fixture
+def out(tmp_path):
+    for arm, scores in SCORES.items():
+        run = write_arm(tmp_path / "runs", arm, scores)
+    write_run(
+        run / f"finetune-{EXPLORED:03d}",
+        finetune_rows("count", range(2)),
+        phase="finetune",
+        arm="count",
+    )
+    return tmp_path / "runs"
+
+
+def report_of(out):
+    write_report(out, out / "report")
+    table = json.loads((out / "report" / "table1.json").read_text())
+    return (out / "report" / "report.md").read_text(), table
+
+
+def edit_rows(log, change):
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    rows = [change(row) or row for row in rows]
+    log.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def test_table_1_json_holds_the_scores_of_every_seed(out):
+    _, table = report_of(out)
+    assert list(table) == ["epistemic", "count-16"]
+    for arm, scores in SCORES.items():
+        by_task = table["count-16" if arm == "count" else arm]
+        assert tuple(by_task) == TASK_NAMES
+        for i, task in enumerate(TASK_NAMES):
+            entry = by_task[task]
+            assert set(entry) == {"seeds", "mean", "iqm", "ci95"}
+            np.testing.assert_allclose(entry["seeds"], np.array(scores) + 10.0 * i)
+            assert entry["mean"] == pytest.approx(np.mean(scores) + 10.0 * i)
+            assert entry["iqm"] == pytest.approx(entry["mean"])  # fewer than 4 seeds
+            low, high = entry["ci95"]
+            assert min(entry["seeds"]) <= low < entry["mean"] < high
+            assert high <= max(entry["seeds"])
+
+
+def test_report_shows_means_spread_and_every_seed(out):
+    text, _ = report_of(out)
+    # 400, 500, 900: mean 600, standard deviation sqrt(70000).
+    assert "| forward | 600 ± 265<br>[" in text
+    assert "| count-16 | 2 | 150 | 160 | 170 | 180 |" in text
+    assert "| P(epistemic > ...) | count-16 |" in text
+    assert "| forward | 1.00 |" in text
+    assert "paper: SU-PETS" not in text
+    # Trials 4 and 5 of two seeds.
+    assert "| 4 | 1000 ± 0.7 (2 seeds) |" in text
+    assert "| 5 | 2000 ± 0.7 (2 seeds) |" in text
+    assert "| laptop-epistemic | 3 | 3 | 4.00 | 1.00 | not logged | 5.00 |" in text
+    assert "jax 9.9, device_kind abacus" in text
+    # Trial 1 of 6 seeds, -(1 + seed).
+    assert "mean of 6 trials: forward -2.0" in text
+
+
+def test_report_says_what_is_missing(out):
+    text, _ = report_of(out)
+    assert "no log of random, oracle." in text
+    assert "no fine-tuning after 3 trials of epistemic" in text
+    log = out / "laptop-count" / "zero-shot-003" / "metrics.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if '"backward"' not in line]
+    log.write_text("".join(line for line in kept if '"seed": 2' not in line))
+    text, table = report_of(out)
+    assert "`count-16` has no zero-shot after 3 trials on backward." in text
+    assert "`count-16` has no zero-shot after 3 trials on forward of seeds 2." in text
+    assert "backward" not in table["count-16"]
+    assert len(table["count-16"]["forward"]["seeds"]) == 2
+    log.unlink()
+    text, table = report_of(out)
+    assert list(table) == ["epistemic"]
+    assert "on forward, backward, front-flip, back-flip." in text
+
+
+def test_exploration_alone_makes_a_report(tmp_path):
+    write_run(
+        tmp_path / "a", explore_rows("random", [0]), phase="explore", arm="random"
+    )
+    text, table = report_of(tmp_path)
+    assert table == {}
+    assert "No zero-shot log." in text
+    assert "No fine-tuning log." in text
+    assert "`random`: explored 3 trials (seeds 0)." in text
+
+
+def test_one_seed_has_no_interval(tmp_path):
+    write_arm(tmp_path, "epistemic", [250.0])
+    text, table = report_of(tmp_path)
+    entry = table["epistemic"]["forward"]
+    assert entry == {"seeds": [250.0], "mean": 250.0, "iqm": 250.0, "ci95": None}
+    assert "| forward | 250 (1 seed) |" in text
+
+
+def test_paper_numbers_stand_beside_the_preset_paper(tmp_path):
+    write_arm(tmp_path, "epistemic", [1.0], preset="paper")
+    write_arm(tmp_path, "epistemic", [2.0], preset="smoke")
+    written = write_report(tmp_path, tmp_path / "report")
+    names = {path.name for path in written}
+    assert {"report.md", "table1.json", "report-smoke.md", "table1-smoke.json"} < names
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| front-flip | 21 (1 seed) | 5916 | 1561 | 129 | 2532 |" in text
+    other = json.loads((tmp_path / "report" / "table1-smoke.json").read_text())
+    assert other["epistemic"]["forward"]["mean"] == 2.0
+
+
+def test_data_efficiency_is_a_table_of_its_own(out):
+    rows = zero_shot_rows("epistemic", [50.0, 60.0, 70.0], explored=1)
+    folder = out / "laptop-epistemic" / "zero-shot-001"
+    write_run(folder, rows, phase="zero-shot", arm="epistemic")
+    text, table = report_of(out)
+    assert "| epistemic | 1 | 60 ± 10 (3 seeds) |" in text
+    assert table["epistemic"]["forward"]["mean"] == 600.0
+
+
+def test_null_returns_are_left_out_and_counted(out):
+    def lose(row):
+        if row["task"] == "forward" and (row["seed"] == 2 or row["trial"] == 1):
+            row["return"] = None
+
+    edit_rows(out / "laptop-epistemic" / "zero-shot-003" / "metrics.jsonl", lose)
+    text, table = report_of(out)
+    entry = table["epistemic"]["forward"]
+    assert entry["seeds"] == [393.0, 493.0, None]
+    assert entry["mean"] == 443.0
+    assert "`epistemic`: 4 of 24 returns of zero-shot are not finite" in text
+    assert "| epistemic | 2 | not finite | 910 |" in text
+
+    def lose_all(row):
+        row["returns"] = dict.fromkeys(TASK_NAMES)
+
+    edit_rows(out / "laptop-epistemic" / "metrics.jsonl", lose_all)
+    text, _ = report_of(out)
+    assert "36 of 36 returns of explore" in text
+
+
+def test_runs_of_other_seeds_are_pooled(out):
+    rows = [
+        {**row, "seed": row["seed"] + 3}
+        for row in zero_shot_rows("epistemic", [600.0, 700.0])
+    ]
+    folder = out / "more" / "zero-shot-003"
+    write_run(folder, rows, phase="zero-shot", arm="epistemic", learning_rate=0.5)
+    other = out / "laptop-epistemic" / "zero-shot-003" / "config.json"
+    config = json.loads(other.read_text())
+    other.write_text(json.dumps({**config, "learning_rate": 0.1}))
+    text, table = report_of(out)
+    seeds = table["epistemic"]["forward"]["seeds"]
+    assert seeds == [400.0, 500.0, 900.0, 600.0, 700.0]
+    # Of five, one is cut off at each end.
+    assert table["epistemic"]["forward"]["iqm"] == pytest.approx(600.0)
+    assert "learning_rate is 0.1 (laptop-epistemic); 0.5 (more)" in text
+
+
+def test_a_seed_in_two_runs_is_an_error(out):
+    rows = zero_shot_rows("epistemic", [1.0])
+    write_run(out / "again" / "zero-shot", rows, phase="zero-shot", arm="epistemic")
+    with pytest.raises(UsageError, match=r"both hold trial 1 of seed 0, task forward"):
+        load(out)
+
+
+def test_a_line_cut_off_is_left_out_and_a_damaged_one_is_an_error(out):
+    log = out / "laptop-count" / "metrics.jsonl"
+    whole = log.read_text()
+    log.write_text(whole[:-20])
+    text, _ = report_of(out)
+    assert "last line of laptop-count/metrics.jsonl is cut off" in text
+    assert "explored 3 trials (seeds 0, 1) and 2 trials (seeds 2)" in text
+    log.write_text("{]\n" + whole)
+    with pytest.raises(UsageError, match=r"metrics\.jsonl:1 is no row"):
+        load(out)
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_no_log_is_an_error(tmp_path, made):
+    out = tmp_path / "runs"
+    if made:
+        (out / ".hidden").mkdir(parents=True)
+        (out / ".hidden" / "metrics.jsonl").write_text("{}\n")
+    with pytest.raises(UsageError, match="no metrics"):
+        write_report(out, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
+def test_figures_show_something(out):
+    from PIL import Image
+
+    paths = write_report(out, out / "report")
+    pictures = [path for path in paths if path.suffix == ".png"]
+    assert len(pictures) == 2
+    # Colours of the arms: epistemic's blue, count's vermillion.
+    for path in pictures:
+        pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+        for color in ([0x00, 0x72, 0xB2], [0xD5, 0x5E, 0x00]):
+            assert (pixels == color).all(axis=-1).sum() > 200
+
+
+def test_iqm_and_mean_against_scipy_and_by_hand():
+    rng = np.random.default_rng(0)
+    for n in range(1, 14):
+        scores = rng.normal(size=n)
+        assert stats.iqm(scores) == pytest.approx(scipy_stats.trim_mean(scores, 0.25))
+    eight = np.array([8.0, 1.0, 100.0, 3.0, 4.0, 5.0, 6.0, -50.0])
+    assert stats.iqm(eight) == pytest.approx(4.5)  # of 3, 4, 5, 6
+    assert stats.mean(eight) == pytest.approx(77.0 / 8)
+
+
+def test_bootstrap_interval_against_scipy():
+    scores = np.random.default_rng(1).normal(100.0, 10.0, size=12)
+    ours = stats.bootstrap_interval([scores], num_resamples=20_000)
+    theirs = scipy_stats.bootstrap(
+        (scores,), np.mean, n_resamples=20_000, method="percentile", rng=2
+    ).confidence_interval
+    # Both are Monte Carlo: 1 % of the spread of the scores.
+    np.testing.assert_allclose(ours, theirs, atol=0.15)
+    assert ours == stats.bootstrap_interval([scores], num_resamples=20_000)
+    assert ours != stats.bootstrap_interval([scores], num_resamples=20_000, seed=1)
+
+
+def test_bootstrap_stays_within_strata():
+    # Within a stratum nothing varies, so no resample can differ.
+    strata = [np.full(3, 1.0), np.full(3, 5.0)]
+    assert stats.bootstrap_interval(strata) == (3.0, 3.0)
+    assert stats.bootstrap_interval([*strata, np.ones(1)]) is None
+    low, high = stats.bootstrap_interval([np.array([0.0, 1.0])])
+    assert (low, high) == (0.0, 1.0)  # each end has a chance of a quarter
+
+
+def test_probability_of_improvement_by_hand_and_scipy():
+    ours, theirs = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0])
+    # 1 > 0, 2 = 2, 2 > 0, 3 > 2, 3 > 0: 4.5 of 6 pairs.
+    assert stats.probability_of_improvement(ours, theirs) == pytest.approx(0.75)
+    u = scipy_stats.mannwhitneyu(ours, theirs).statistic
+    assert stats.probability_of_improvement(ours, theirs) == pytest.approx(u / 6)
+
+
+def test_summary_of_no_finite_score_is_none():
+    assert stats.summarize(np.array([np.nan])) is None
+    one = stats.summarize(np.array([np.nan, 4.0]))
+    assert one == stats.Summary(1, 4.0, None, 4.0, None)

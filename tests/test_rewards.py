@@ -1,0 +1,147 @@
+import jax
+import jax.numpy as jnp
+import jaxpets
+import numpy as np
+import pytest
+import reference
+import toys
+from jaxpets.rewards import epistemic, one_step_disagreement
+
+E, P, D = 5, 4, 6
+
+
+def particles(seed=0):
+    rng = np.random.default_rng(seed)
+    scale = np.array([0.01, 0.1, 1.0, 3.0, 10.0, 50.0])
+    states = scale * (rng.normal(size=(E, 1, D)) + 0.3 * rng.normal(size=(E, P, D)))
+    return states.astype(np.float32), (scale**2).astype(np.float32)
+
+
+def reward(states, base):
+    obs = jnp.zeros((E, P, D))
+    return epistemic(jnp.asarray(base), obs, jnp.zeros(2), jnp.asarray(states))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_epistemic_equals_the_reference(seed):
+    states, base = particles(seed)
+    got = reward(states, base)
+    assert got.shape == ()
+    np.testing.assert_allclose(got, reference.epistemic(states, base), rtol=1e-5)
+
+
+def test_epistemic_is_zero_for_members_that_agree():
+    states, base = particles()
+    agreed = np.broadcast_to(states[:1], states.shape)
+    # float32 keeps 1e-7 of the states' size.
+    np.testing.assert_allclose(reward(agreed, base), 0.0, atol=1e-6)
+    # The particles may differ, as long as their mean does not.
+    turned = np.stack([np.roll(states[0], e, axis=0) for e in range(E)])
+    np.testing.assert_allclose(reward(turned, base), 0.0, atol=1e-5)
+
+
+def test_epistemic_falls_with_the_root_of_the_baseline():
+    states, base = particles()
+    np.testing.assert_allclose(
+        reward(states, 4 * base), reward(states, base) / 2, rtol=1e-6
+    )
+
+
+def test_epistemic_has_no_unit():
+    states, base = particles()
+    unit = np.float32([1, 10, 1e3, 1e-3, 7, 0.1])
+    np.testing.assert_allclose(
+        reward(states * unit, base * unit**2), reward(states, base), rtol=1e-5
+    )
+
+
+def test_epistemic_forgets_the_order_of_members_and_particles():
+    states, base = particles()
+    want = reward(states, base)
+    np.testing.assert_allclose(reward(states[[3, 1, 4, 0, 2]], base), want, rtol=1e-5)
+    mixed = states.copy()
+    mixed[1] = states[1, [2, 0, 3, 1]]
+    np.testing.assert_allclose(reward(mixed, base), want, rtol=1e-5)
+    # But a particle that changes its member changes the reward.
+    mixed[0, 0], mixed[1, 0] = states[1, 0], states[0, 0]
+    assert abs(reward(mixed, base) - want) > 1e-3
+
+
+def test_epistemic_looks_only_at_the_state_reached():
+    states, base = particles()
+    got = epistemic(jnp.asarray(base), jnp.asarray(9 * states), jnp.ones(2), states)
+    np.testing.assert_array_equal(got, reward(states, base))
+
+
+def test_epistemic_passes_on_what_diverged():
+    states, base = particles()
+    states[2, 1, 3] = np.inf
+    assert not np.isfinite(reward(states, base))
+
+
+def test_epistemic_refuses_what_does_not_fit():
+    states, base = particles()
+    with pytest.raises(ValueError, match=r"baseline_variance must be float32\[6\], got"):
+        reward(states, base[:3])
+    with pytest.raises(ValueError, match=r"next_obs must be float32\[E, P, D\], got"):
+        reward(states[0], base)
+    with pytest.raises(ValueError, match="at least 2 members, got 1"):
+        reward(states[:1], base)
+
+
+# -- one-step disagreement -----------------------------------------------------------
+
+
+def affine(params, obs, action):
+    """Member e predicts w_e * obs + sum(action), with variance s_e."""
+    weight, variance = params
+    mean = weight[:, None, :] * obs + jnp.sum(action, axis=-1)[:, None]
+    return mean, jnp.broadcast_to(variance[:, None, :], mean.shape)
+
+
+def test_one_step_disagreement_equals_the_reference():
+    rng = np.random.default_rng(0)
+    obs, _ = particles()
+    weight = rng.normal(size=(E, D)).astype(np.float32)
+    variance = rng.uniform(0.5, 2, size=(E, D)).astype(np.float32)
+    fn = one_step_disagreement(affine)
+    got = fn((weight, variance), jnp.asarray(obs), jnp.ones(2), jnp.zeros((E, P, D)))
+    assert got.shape == (E, P)
+    means = np.float64(weight)[:, None, None] * np.float64(obs)[None] + 2.0
+    ratio = means.var(0) / np.float64(variance).mean(0)
+    want = np.sqrt(ratio).mean(-1)
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_one_step_disagreement_is_zero_for_members_that_agree():
+    obs, _ = particles()
+    same = (jnp.ones((E, D)), jnp.ones((E, D)))
+    got = one_step_disagreement(affine)(same, jnp.asarray(obs), jnp.ones(2), obs)
+    np.testing.assert_allclose(got, 0.0, atol=1e-5)
+
+
+def test_one_step_disagreement_with_the_ensemble(key):
+    model = toys.small_ensemble()
+    params = model.init(key)
+    fn = one_step_disagreement(model.predict)
+    obs = jax.random.normal(key, (3, 2, 2))
+    got = fn(params, obs, jnp.ones(1), obs)
+    # All six particles as the rows of every member.
+    rows = jnp.broadcast_to(obs.reshape(6, 2), (3, 6, 2))
+    mean, variance = (np.float64(x) for x in model.predict(params, rows, jnp.ones((6, 1))))
+    want = np.sqrt(mean.var(0) / variance.mean(0)).mean(-1)
+    np.testing.assert_allclose(got, want.reshape(3, 2), rtol=1e-4)
+
+
+def test_one_step_disagreement_refuses_what_does_not_fit():
+    fn = one_step_disagreement(affine)
+    params = (jnp.ones((1, D)), jnp.ones((1, D)))
+    with pytest.raises(ValueError, match="at least 2 members, got 1"):
+        fn(params, jnp.zeros((1, P, D)), jnp.ones(2), jnp.zeros((1, P, D)))
+    with pytest.raises(ValueError, match=r"obs must be float32\[E, P, D\], got"):
+        fn(params, jnp.zeros((P, D)), jnp.ones(2), jnp.zeros((P, D)))
+
+
+def test_namespace_lists_what_it_has():
+    for name in jaxpets.rewards.__all__:
+        assert callable(getattr(jaxpets.rewards, name))
