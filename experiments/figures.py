@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 # Okabe and Ito's palette; an arm has the same colour in every figure.
 _COLORS = {
@@ -83,7 +84,7 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
 
     Arms value different things, so each has its own axis; turns are shared.
     """
-    arms = list(dict.fromkeys([*value, *turns]))
+    arms = list(dict.fromkeys([*turns, *value]))
     with mpl.rc_context(_STYLE):
         figure = _figure(max(2.6 * len(arms), 5.0), 4.6)
         grid = figure.subplots(2, len(arms), squeeze=False, sharex=True)
@@ -95,7 +96,7 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
                     _draw(axes, {arm: curves[arm]}, arms, running_max=False)
                 else:
                     axes.set_yticks([])
-                    axes.text(0.5, 0.5, "no number logged", color="#7F7F7F",
+                    axes.text(0.5, 0.5, "none", color="#7F7F7F",
                               transform=axes.transAxes, ha="center")  # fmt: skip
             _log_if_wide(above, value.get(arm))
             below.set_xlabel("trial")
@@ -130,6 +131,7 @@ def _draw(
 ) -> None:  # fmt: skip
     axes.grid(axis="y")
     axes.set_axisbelow(True)
+    axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
     axes.axhline(0.0, color="#BFBFBF", linewidth=0.8, zorder=1)
     for arm, (trials, values) in curves.items():
         paint = color(arm, arms)

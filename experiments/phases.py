@@ -159,7 +159,7 @@ def _run(
 ) -> Trials | None:  # fmt: skip
     """Runs trials `first + 1` to `last`, or what is left of them; saves after each."""
     checkpoints, log = folder / "checkpoints", folder / "metrics.jsonl"
-    found = checkpoint.restore(checkpoints, init, warn=warn)
+    found = checkpoint.restore(checkpoints, init, warn=_warning(say))
     done, state, meta = found or (first, init, {"log": 0})
     rundir.cut_log(log, meta["log"])
     if done >= last:
@@ -194,9 +194,15 @@ def _explored(config: Config, source: Path, step: int, parts: Parts, say: Say) -
     keys = trial_keys(config, EXPLORE, 0)
     init = jax.vmap(parts.learner.init, out_axes=LEARNER_AXES)
     template = jax.eval_shape(init, keys)
-    found = checkpoint.restore(source / "checkpoints", template, step=step, warn=warn)
+    found = checkpoint.restore(
+        source / "checkpoints", template, step=step, warn=_warning(say)
+    )
     assert found is not None
     return found[1]
+
+
+def _warning(say: Say) -> Say:
+    return lambda line: say(f"warning: {line}")
 
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:

@@ -36,8 +36,8 @@ _TABLE_1 = (
     "other way round, so its two flip rows may be exchanged."
 )
 _FIGURE_4 = (
-    "Left: return under each task while exploring without it (the oracle has the reward "
-    "of forward). Right: zero-shot (dot: mean of all its seeds) and fine-tuning. Bold: "
+    "Left: return under each task while exploring without it (the oracle has "
+    "forward's). Right: zero-shot (dot: mean of all its seeds) and fine-tuning. Bold: "
     "mean of the seeds, where all have a number; thin: one seed; dotted: mean of each "
     "seed's best so far."
 )
@@ -91,9 +91,11 @@ def _write(rows: Sequence[Row], out: Path, files: _Files) -> None:
     found = scores(rows, explored)
     _write_json(files.table_1, found)
     figures.figure_4(files.figure_4, _panels(rows, found, explored), explored)
+    # Random actions are of no value to anyone, whatever a log says.
+    planned = [r for r in rows if "random" not in (r.arm, r.data.get("planner"))]
     figures.exploration(
         files.exploration,
-        _curves(exploring(rows, "value")),
+        _curves(exploring(planned, "value")),
         _curves(exploring(rows, "turns")),
     )
     lines = [

@@ -1,0 +1,345 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jaxpets
+import numpy as np
+import optax
+import pytest
+import reference
+import toys
+from jaxpets import FitConfig
+
+CAPACITY = 40
+
+
+def dataset_of(data, capacity=CAPACITY):
+    obs_size, action_size = data.obs.shape[1], data.action.shape[1]
+    return jaxpets.append(jaxpets.init_dataset(capacity, obs_size, action_size), data)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return toys.small_ensemble()
+
+
+@pytest.fixture(scope="module")
+def params(model):
+    return jax.jit(model.init)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def fitter(model):
+    return jaxpets.fit(model, optax.adam(1e-3), FitConfig(num_epochs=3, batch_size=8))
+
+
+@pytest.fixture(scope="module")
+def step(fitter):
+    return jax.jit(fitter.step)
+
+
+# -- which rows are shown ------------------------------------------------------------
+
+
+def shown_rows(model, params, size, *, num_epochs, batch_size, seed=0):
+    """Which rows of the data each member saw: `[epochs, batches, E, batch]`, weights.
+
+    The targets carry the row's number; the loss reports what it was given.
+    """
+    seen = []
+
+    def loss(network, inputs, targets, weight):
+        jax.debug.callback(
+            lambda *x: seen.append(tuple(map(np.asarray, x))),
+            targets[..., 0],
+            weight,
+            ordered=True,
+        )
+        return model.loss(network, inputs, targets, weight)
+
+    number = jnp.arange(size, dtype=jnp.float32)[:, None] + jnp.zeros((1, 2))
+    data = jaxpets.Transition(0 * number, jnp.zeros((size, 1)), number)
+    config = FitConfig(num_epochs=num_epochs, batch_size=batch_size)
+    fitter = jaxpets.fit(model._replace(loss=loss), optax.sgd(0.0), config)
+    key = jax.random.key(seed)
+    jax.jit(fitter.step)(params, key, fitter.init(params), dataset_of(data))
+    jax.effects_barrier()
+    rows = np.stack([x[0] for x in seen]).astype(int)
+    weights = np.stack([x[1] for x in seen])
+    shape = (num_epochs, -1)
+    return rows.reshape(*shape, *rows.shape[1:]), weights.reshape(
+        *shape, weights.shape[-1]
+    )
+
+
+@pytest.mark.parametrize("size", [1, 8, 19, 40])
+def test_an_epoch_shows_each_member_its_bootstrap_once(model, params, size):
+    rows, weights = shown_rows(model, params, size, num_epochs=2, batch_size=8)
+    epochs, batches, members, _ = rows.shape
+    assert (epochs, batches, members) == (2, -(-size // 8), 3)
+    used = weights > 0
+    assert used.sum((1, 2)).tolist() == [size, size]
+    bootstraps = []
+    for e in range(members):
+        epoch_rows = [rows[i, :, e][used[i]] for i in range(epochs)]
+        assert all(0 <= r < size for r in np.concatenate(epoch_rows))
+        # The same bootstrap in every epoch, in another order.
+        assert sorted(epoch_rows[0]) == sorted(epoch_rows[1])
+        if size > 8:
+            assert epoch_rows[0].tolist() != epoch_rows[1].tolist()
+        bootstraps.append(sorted(epoch_rows[0]))
+    if size > 8:
+        assert bootstraps[0] != bootstraps[1] != bootstraps[2]
+
+
+def test_the_last_batch_is_weighted_by_what_is_left(model, params):
+    _, weights = shown_rows(model, params, 19, num_epochs=1, batch_size=8)
+    want = [np.full(8, 1 / 8), np.full(8, 1 / 8), [1 / 3] * 3 + [0.0] * 5]
+    np.testing.assert_allclose(weights[0], want, rtol=1e-6)
+
+
+def test_bootstraps_are_drawn_with_replacement(model, params):
+    missed = []
+    for seed in range(5):
+        rows, _ = shown_rows(
+            model, params, CAPACITY, num_epochs=1, batch_size=8, seed=seed
+        )
+        for e in range(3):
+            missed.append(1 - len(np.unique(rows[0, :, e])) / CAPACITY)
+    # (1 - 1/40)^40 = 0.363 of the rows are never drawn; 15 bootstraps of 40.
+    assert abs(np.mean(missed) - 0.363) < 0.06
+
+
+# -- updates -------------------------------------------------------------------------
+
+
+def test_partial_batch_equals_the_reference_on_its_rows(model, params):
+    """Five rows in a batch of eight: loss and update of these five, with repeats."""
+    rows, weights = shown_rows(model, params, 5, num_epochs=1, batch_size=8)
+    picks = rows[0, 0][:, weights[0, 0] > 0]
+    assert picks.shape == (3, 5)
+    data = toys.transitions(5)
+    config = FitConfig(num_epochs=1, batch_size=8)
+    fitter = jaxpets.fit(model, optax.sgd(0.1), config)
+    dataset = dataset_of(data)
+    new, _, metrics = jax.jit(fitter.step)(
+        params, jax.random.key(0), fitter.init(params), dataset
+    )
+    inputs = np.concatenate([data.obs, data.action], axis=-1)[picks]
+    targets = np.asarray(data.next_obs - data.obs)[picks]
+    scaler = reference.input_scaler(
+        np.concatenate([data.obs, data.action], axis=-1).astype(np.float64)
+    )
+    stack = params.network.members["params"]
+    want = reference.pets_loss(
+        [stack[f"layer_{i}"]["kernel"] for i in range(3)],
+        [stack[f"layer_{i}"]["bias"] for i in range(3)],
+        params.network.min_logvar,
+        params.network.max_logvar,
+        scaler,
+        inputs,
+        targets,
+        decays=(1e-4, 2e-4, 3e-4),
+    )
+    np.testing.assert_allclose(metrics.loss, want, rtol=1e-5)
+    assert metrics.num_updates == 1 and metrics.num_skipped == 0
+    # And the step is the gradient over exactly these rows.
+    scaled = jnp.asarray((inputs - scaler[0]) / scaler[1], jnp.float32)
+    weight = jnp.full((5,), 0.2, jnp.float32)
+    grads, _ = jax.jit(jax.grad(model.loss, has_aux=True))(
+        params.network, scaled, jnp.asarray(targets), weight
+    )
+    stepped = jax.tree.map(lambda p, g: p - 0.1 * g, params.network, grads)
+    toys.assert_trees_close(new.network, stepped, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 8, 9, 40])
+def test_counts_its_updates(step, fitter, params, size):
+    dataset = dataset_of(toys.transitions(size))
+    state = fitter.init(params)
+    _, state, metrics = step(params, jax.random.key(0), state, dataset)
+    assert metrics.num_updates == 3 * -(-size // 8)
+    assert int(state.opt_state[0].count) == metrics.num_updates
+
+
+def test_growing_data_do_not_retrace(model, params):
+    fitter = jaxpets.fit(model, optax.adam(1e-3), FitConfig(num_epochs=1, batch_size=8))
+    step = jax.jit(fitter.step)
+    state, dataset = fitter.init(params), jaxpets.init_dataset(CAPACITY, 2, 1)
+    for trial in range(4):
+        dataset = jaxpets.append(dataset, toys.transitions(12, seed=trial))
+        key = jax.random.key(trial)
+        params, state, _ = step(params, key, state, dataset)
+    assert step._cache_size() == 1
+
+
+def test_training_goes_on_where_it_stopped(step, fitter, params):
+    dataset = dataset_of(toys.transitions(40))
+    first, state, before = step(params, jax.random.key(0), fitter.init(params), dataset)
+    _, state, after = step(first, jax.random.key(1), state, dataset)
+    assert after.loss < before.loss
+    assert int(state.opt_state[0].count) == 30  # Adam's moments are kept, too
+
+
+def test_no_data_change_nothing(step, fitter, params):
+    empty = jaxpets.init_dataset(CAPACITY, 2, 1)
+    after, _, metrics = step(params, jax.random.key(0), fitter.init(params), empty)
+    toys.assert_trees_close(after, params, rtol=0)
+    assert metrics.num_updates == 0 and metrics.loss == 0
+
+
+@pytest.mark.slow
+def test_fits_a_linear_gaussian_system():
+    """The mean is the true one and the variance the noise's, on data not seen."""
+    rng = np.random.default_rng(0)
+    noise = np.array([0.05, 0.2])
+
+    def system(size):
+        obs = rng.normal(size=(size, 2))
+        action = rng.uniform(-1, 1, size=(size, 1))
+        mean = obs @ np.array([[0.9, -0.2], [0.1, 0.8]]) + action * [0.5, -0.3]
+        rows = (obs, action, mean + noise * rng.normal(size=obs.shape))
+        return [jnp.asarray(x, jnp.float32) for x in rows], mean
+
+    rows, _ = system(1000)
+    model = toys.small_ensemble(
+        hidden_sizes=(32, 32), weight_decays=(0.0, 0.0, 0.0), bound_decay=0.01
+    )
+    config = FitConfig(num_epochs=60, batch_size=32)
+    fitter = jaxpets.fit(model, optax.adam(3e-3), config)
+    params = jax.jit(model.init)(jax.random.key(0))
+    dataset = dataset_of(jaxpets.Transition(*rows), 1000)
+    params, _, metrics = jax.jit(fitter.step)(
+        params, jax.random.key(1), fitter.init(params), dataset
+    )
+    (obs, action, _), mean = system(500)
+    got, variance = model.predict(params, jnp.broadcast_to(obs, (3, 500, 2)), action)
+    error = np.asarray(got) - mean
+    # A tenth of the signal's deviation; a network of 32 on 1000 noisy rows.
+    assert np.sqrt((error**2).mean()) < 0.06
+    np.testing.assert_allclose(np.sqrt(np.median(variance, (0, 1))), noise, rtol=0.25)
+    assert metrics.num_skipped == 0
+    # w_base has come down from exp(0.5) to the scale of the noise.
+    assert jnp.all(jaxpets.max_variance(params) < 1.0)
+
+
+def test_bootstraps_make_members_differ(model, params, step, fitter):
+    """Members that start equal end unequal."""
+    same = jax.tree.map(
+        lambda x: jnp.broadcast_to(x[:1], x.shape), params.network.members
+    )
+    network = params.network._replace(members=same)
+    start = params._replace(network=network)
+    dataset = dataset_of(toys.transitions(40))
+    after, _, _ = step(start, jax.random.key(0), fitter.init(start), dataset)
+    for leaf in jax.tree.leaves(after.network.members):
+        assert jnp.any(leaf[0] != leaf[1]) and jnp.any(leaf[1] != leaf[2])
+
+
+def test_vmapped_seeds_equal_single_runs(model, fitter, step):
+    keys = jax.random.split(jax.random.key(7), 3)
+    all_params = jax.jit(jax.vmap(model.init))(keys)
+    sizes = (40, 13, 24)
+    sets = [dataset_of(toys.transitions(n, seed=n)) for n in sizes]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *sets)
+    states = jax.vmap(fitter.init)(all_params)
+    got = jax.jit(jax.vmap(fitter.step))(all_params, keys, states, stacked)
+    for i in range(3):
+        pick = lambda x, i=i: x[i]  # noqa: E731
+        one = jax.tree.map(pick, all_params)
+        want = step(one, keys[i], fitter.init(one), sets[i])
+        # Batched products round otherwise; fifteen updates.
+        toys.assert_trees_close(jax.tree.map(pick, got), want, rtol=1e-3, atol=1e-4)
+
+
+# -- guards --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_update_whose_loss_is_not_finite_is_dropped(
+    model, params, step, fitter, bad
+):
+    data = toys.transitions(40)
+    data = data._replace(next_obs=data.next_obs.at[11].set(bad))
+    after, state, metrics = step(
+        params, jax.random.key(0), fitter.init(params), dataset_of(data)
+    )
+    for leaf in jax.tree.leaves((after.network, state)):
+        assert jnp.all(jnp.isfinite(leaf))
+    assert 0 < metrics.num_skipped < metrics.num_updates
+    # Dropped updates leave the optimizer alone, too.
+    assert int(state.opt_state[0].count) == metrics.num_updates - metrics.num_skipped
+    assert jnp.isfinite(metrics.loss)
+
+
+def test_the_model_stays_usable_after_a_bad_row(model, params, step, fitter):
+    data = toys.transitions(40)
+    data = data._replace(next_obs=data.next_obs.at[11].set(jnp.nan))
+    after, _, _ = step(
+        params, jax.random.key(0), fitter.init(params), dataset_of(data)
+    )
+    drawn = model.sample(
+        after, jax.random.key(1), jnp.zeros((3, 4, 2)), jnp.zeros((4, 1))
+    )
+    assert jnp.all(jnp.isfinite(drawn))
+
+
+def test_an_update_whose_gradient_is_not_finite_is_dropped(model, params):
+    """A loss may be finite where its gradient is not."""
+
+    def loss(network, inputs, targets, weight):
+        total, mse = model.loss(network, inputs, targets, weight)
+        zero = jnp.sum(weight) - jnp.sum(weight)
+        # The root has the value 0 and an infinite slope.
+        return total + jnp.sqrt(zero * jnp.sum(network.max_logvar)), mse
+
+    fitter = jaxpets.fit(model._replace(loss=loss), optax.adam(1e-3), FitConfig())
+    dataset = dataset_of(toys.transitions(40))
+    after, _, metrics = jax.jit(fitter.step)(
+        params, jax.random.key(0), fitter.init(params), dataset
+    )
+    for leaf in jax.tree.leaves(after.network):
+        assert jnp.all(jnp.isfinite(leaf))
+    assert metrics.num_skipped == metrics.num_updates
+
+
+def test_max_logvar_never_crosses_min_logvar():
+    """A hundred times the pull on the bounds and a high rate: they meet and stop."""
+    model = toys.small_ensemble(bound_decay=1.0)
+    params = jax.jit(model.init)(jax.random.key(0))
+    config = FitConfig(num_epochs=20, batch_size=8)
+    fitter = jaxpets.fit(model, optax.adam(0.3), config)
+    step = jax.jit(fitter.step)
+    state, dataset = fitter.init(params), dataset_of(toys.transitions(40))
+    met = False
+    for call in range(5):
+        params, state, _ = step(params, jax.random.key(call), state, dataset)
+        gap = params.network.max_logvar - params.network.min_logvar
+        assert jnp.all(gap > 0)
+        met |= bool(jnp.any(gap < 0.2))
+        assert jnp.all(jaxpets.max_variance(params) > 1e-12)
+    assert met  # the case is the one meant
+
+
+def test_bad_settings_fail_when_built():
+    with pytest.raises(ValueError, match="num_epochs must be at least 1, got 0"):
+        FitConfig(num_epochs=0)
+    with pytest.raises(TypeError, match="batch_size must be a Python int"):
+        FitConfig(batch_size=32.0)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        FitConfig().batch_size = 1
+
+
+def test_a_raw_key_fails_when_traced(fitter, params):
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    with pytest.raises(TypeError, match="key must be a typed key"):
+        fitter.step(params, jax.random.PRNGKey(0), fitter.init(params), dataset)
+
+
+@pytest.mark.parametrize("sizes", [(3, 1), (2, 2)])
+def test_a_dataset_of_other_sizes_fails_when_traced(fitter, params, sizes):
+    dataset = jaxpets.init_dataset(CAPACITY, *sizes)
+    with pytest.raises(ValueError, match=r"dataset.* must be float32\[.*got float32"):
+        jax.eval_shape(
+            fitter.step, params, jax.random.key(0), fitter.init(params), dataset
+        )

@@ -1,0 +1,195 @@
+"""Structure: who may import whom, what is public, what the library never does."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import jaxpets
+import pytest
+
+PACKAGE = Path(jaxpets.__file__).parent
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+# A module may import lower layers only, and none of its own row.
+LAYERS = {
+    "_src.types": 0,
+    "_src.checks": 0,
+    "_src.moments": 0,
+    "_src.plan": 1,
+    "_src.cem": 1,
+    "_src.icem": 1,
+    "_src.mppi": 1,
+    "_src.rollout": 1,
+    "_src.rewards": 1,
+    "_src.pseudo_counts": 1,
+    "_src.dataset": 1,
+    "_src.ensemble": 1,
+    "_src.fit": 2,
+    "_src.unroll": 2,
+    "envs.half_cheetah": 2,
+    "envs.adapters": 2,
+    "envs": 3,
+    "_src.learner": 3,
+    "rewards": 4,
+    "": 5,
+    "_src": 0,
+}
+
+# Where third parties may be imported; jax and chex anywhere.
+HOMES = {
+    "flax": {"_src.ensemble"},
+    "optax": {"_src.fit"},
+    "mujoco": {"envs.half_cheetah"},
+    "brax": set(),
+    "gymnasium": set(),
+    "orbax": set(),
+    "tyro": set(),
+}
+
+
+def name_of(path):
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(part for part in parts if part != "__init__")
+
+
+MODULES = {name_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
+
+
+def imports(tree):
+    """Dotted names of everything that is imported, wherever it stands."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+            found.append(node.module)
+    return found
+
+
+def own_imports(name):
+    """Modules of jaxpets that `name` imports, by their names in LAYERS."""
+    found = set()
+    for dotted in imports(TREES[name]):
+        if dotted.split(".")[0] == "jaxpets":
+            inner = dotted.removeprefix("jaxpets").lstrip(".")
+            # `from jaxpets._src.plan import plan` also reads as a name in a module.
+            while inner and inner not in LAYERS:
+                inner = inner.rpartition(".")[0]
+            if inner or dotted == "jaxpets":
+                found.add(inner)
+    packages = {module.rpartition(".")[0] for module in found if "." in module}
+    return found - packages - ({""} if len(found) > 1 else set())
+
+
+def test_every_module_has_a_layer():
+    assert set(MODULES) == set(LAYERS)
+
+
+@pytest.mark.parametrize("name", sorted(LAYERS))
+def test_imports_go_down(name):
+    for other in own_imports(name):
+        assert LAYERS[other] < LAYERS[name], f"{name} imports {other}"
+
+
+def test_the_rule_sees_what_is_imported():
+    assert "_src.types" in own_imports("_src.plan")
+    assert {"_src.ensemble", "_src.types"} <= own_imports("_src.fit")
+    assert "_src.rewards" in own_imports("rewards")
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_third_parties_have_one_home(name):
+    for dotted in imports(TREES[name]):
+        home = HOMES.get(dotted.split(".")[0])
+        assert home is None or name in home, f"{name} imports {dotted}"
+
+
+def calls(tree):
+    """Dotted names of everything called or used as a decorator."""
+    nodes = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            nodes.append(node.func)
+        nodes += getattr(node, "decorator_list", [])
+    return {ast.unparse(node) for node in nodes}
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_the_library_never_jits_prints_or_pickles(name):
+    tree = TREES[name]
+    used = {ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    assert not {"jax.jit", "jax.pmap"} & (used | calls(tree))
+    assert not any(dotted == "jax.jit" for dotted in imports(tree))
+    assert not {"print", "input", "open"} & calls(tree)
+    modules = {dotted.split(".")[0] for dotted in imports(tree)}
+    assert not modules & {"pickle", "cloudpickle", "dill", "shelve"}
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_sizes_stay_small(name):
+    assert len(MODULES[name].read_text().splitlines()) <= 300
+
+
+OUTSIDE = [
+    path for part in ("experiments", "benchmarks") for path in (REPOSITORY / part).rglob("*.py")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: path.stem)
+def test_the_outside_uses_public_names_only(path):
+    tree = ast.parse(path.read_text())
+    for dotted in imports(tree):
+        assert not dotted.startswith("jaxpets._src"), f"{path.name} imports {dotted}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            assert node.attr != "_src", f"{path.name} reaches into _src"
+
+
+@pytest.mark.parametrize("module", [jaxpets, jaxpets.rewards])
+def test_public_names_are_those_listed(module):
+    public = {
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_") and not isinstance(value, type(ast))
+    }
+    listed = set(module.__all__)
+    assert public <= listed
+    assert all(hasattr(module, name) for name in listed)
+    assert len(module.__all__) == len(listed)
+
+
+@pytest.mark.parametrize("module", [jaxpets, jaxpets.rewards])
+def test_public_functions_are_documented(module):
+    for name in module.__all__:
+        value = getattr(module, name)
+        if callable(value):
+            assert value.__doc__, name
+
+
+def test_import_is_light_and_silent():
+    """No simulator, no optional package, no output, no compilation."""
+    code = (
+        "import sys, jaxpets\n"
+        "heavy = ['mujoco', 'brax', 'gymnasium', 'orbax', 'tyro', 'matplotlib']\n"
+        "sys.exit(','.join(m for m in heavy if m in sys.modules) or 0)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=None,
+        cwd=PACKAGE.parent,
+    )
+    assert result.returncode == 0, result.stderr
+    assert not result.stdout and not result.stderr
+
+
+def test_version_is_that_of_the_package():
+    assert jaxpets.__version__.count(".") == 2
+    assert "__version__" in vars(jaxpets)

@@ -1,0 +1,168 @@
+import jax
+import jax.numpy as jnp
+import jaxpets
+import numpy as np
+import optax
+import pytest
+import toys
+from jaxpets import FitConfig, RewardData
+
+ENV = toys.cart_env()
+MODEL = toys.small_ensemble()
+FITTER = jaxpets.fit(MODEL, optax.adam(3e-3), FitConfig(num_epochs=10, batch_size=8))
+ROLLOUT = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
+EXPLORER = jaxpets.plan(ROLLOUT, jaxpets.rewards.epistemic, toys.optimizer("cem"))
+CHANCE = jaxpets.random_planner(ENV.action_low, ENV.action_high)
+BASELINE = RewardData(
+    init=lambda key: jnp.zeros(2),
+    refresh=lambda data, params, dataset: jaxpets.max_variance(params),
+)
+LENGTH = 20
+
+
+def build(reward_data=BASELINE, capacity=3 * LENGTH, trial_length=LENGTH):
+    return jaxpets.learner(
+        ENV, MODEL, FITTER, reward_data, trial_length=trial_length, capacity=capacity
+    )
+
+
+LEARNER = build()
+INIT = jax.jit(LEARNER.init)
+STEPS = [
+    jax.jit(lambda key, state, planner=planner: LEARNER.step(planner, key, state))
+    for planner in (CHANCE, EXPLORER)
+]
+
+
+def trial(number, key, state):
+    """Trial 0 is random, the others explore; keys as an experiment derives them."""
+    return STEPS[min(number, 1)](jax.random.fold_in(key, number), state)
+
+
+def test_starts_with_nothing_but_a_model(key):
+    state = INIT(key)
+    assert state.dataset.size == 0
+    assert state.dataset.data.obs.shape == (3 * LENGTH, 2)
+    np.testing.assert_allclose(state.reward, np.exp(0.5), rtol=1e-6)
+
+
+def test_a_trial_acts_learns_and_refreshes(key):
+    state = INIT(key)
+    after, output = trial(0, key, state)
+    assert after.dataset.size == LENGTH
+    assert output.transitions.obs.shape == (LENGTH, 2)
+    assert output.plans.action.shape == (LENGTH, 1)
+    np.testing.assert_array_equal(
+        after.dataset.data.obs[:LENGTH], output.transitions.obs
+    )
+    assert output.fit.num_updates == 10 * 3
+    np.testing.assert_array_equal(after.reward, jaxpets.max_variance(after.params))
+    assert jnp.any(after.reward != state.reward)
+
+
+def test_the_model_gets_better_and_the_planner_uses_it(key):
+    state, losses = INIT(key), []
+    for number in range(3):
+        state, output = trial(number, key, state)
+        losses.append(float(output.fit.mse))
+        assert jnp.all(jnp.abs(output.plans.action) <= 1)
+    assert losses[-1] < losses[0]
+    assert output.plans.value.mean() > 0  # disagreement, summed over the plan
+
+
+def test_resumed_equals_straight_bitwise(key):
+    """State through the host, as a checkpoint takes it, and a new program."""
+    state = INIT(key)
+    for number in range(3):
+        state, output = trial(number, key, state)
+    again = INIT(key)
+    for number in range(2):
+        again, _ = trial(number, key, again)
+    saved = jax.tree.map(np.asarray, again)
+    loaded = jax.tree.map(jnp.asarray, saved)
+    fresh = build()
+    step = jax.jit(lambda key, state: fresh.step(EXPLORER, key, state))
+    resumed, resumed_output = step(jax.random.fold_in(key, 2), loaded)
+    toys.assert_trees_close((resumed, resumed_output), (state, output), rtol=0)
+
+
+def test_one_trace_and_stable_avals_while_data_grow(key):
+    step = jax.jit(lambda key, state: LEARNER.step(CHANCE, key, state))
+    state = INIT(key)
+    want = toys.avals(state)
+    for number in range(4):  # past the capacity
+        state, _ = step(jax.random.fold_in(key, number), state)
+        assert toys.avals(state) == want
+    assert step._cache_size() == 1
+    assert state.dataset.size == 3 * LENGTH
+
+
+def test_vmapped_seeds_equal_single_runs():
+    keys = jax.random.split(jax.random.key(3), 2)
+    states = jax.jit(jax.vmap(LEARNER.init))(keys)
+    step = jax.jit(jax.vmap(lambda key, state: LEARNER.step(CHANCE, key, state)))
+    got = step(keys, states)
+    for i in range(2):
+        want = STEPS[0](keys[i], INIT(keys[i]))
+        one = jax.tree.map(lambda x, i=i: x[i], got)
+        # Batched products round otherwise; thirty updates with Adam.
+        toys.assert_trees_close(one, want, rtol=5e-3, atol=5e-4)
+
+
+def test_learning_alone_equals_its_half_of_a_trial(key):
+    state = INIT(key)
+    transitions = toys.transitions(LENGTH)
+    after, metrics = jax.jit(LEARNER.learn)(key, state, transitions)
+    dataset = jaxpets.append(state.dataset, transitions)
+    want = jax.jit(FITTER.step)(state.params, key, state.fit, dataset)
+    toys.assert_trees_close((after.params, after.fit, metrics), want, rtol=0)
+    toys.assert_trees_close(after.dataset, dataset, rtol=0)
+
+
+def test_counts_are_rebuilt_once_per_trial(key):
+    counter = RewardData(
+        init=lambda key: jaxpets.rewards.count_states(
+            jaxpets.rewards.simhash(key, 16, 2), jaxpets.init_dataset(3 * LENGTH, 2, 1)
+        ),
+        refresh=lambda counts, params, dataset: jaxpets.rewards.count_states(
+            counts.projection, dataset
+        ),
+    )
+    learner = build(counter)
+    state = jax.jit(learner.init)(key)
+    assert state.reward.size == 0
+    planner = jaxpets.plan(
+        ROLLOUT, jaxpets.rewards.pseudo_count, toys.optimizer("cem")
+    )
+    step = jax.jit(lambda key, state: learner.step(planner, key, state))
+    for number in range(2):
+        state, output = step(jax.random.fold_in(key, number), state)
+        assert state.reward.size == state.dataset.size == (number + 1) * LENGTH
+        assert jnp.all(output.plans.value > 0)
+    visited = jaxpets.rewards.lookup(state.reward, output.transitions.next_obs)
+    assert jnp.all(visited >= 1)
+
+
+def test_bad_settings_fail_when_built(key):
+    with pytest.raises(ValueError, match="capacity must be at least 20, got 10"):
+        build(capacity=10)
+    with pytest.raises(ValueError, match="trial_length must be at least 1, got 0"):
+        build(trial_length=0)
+    with pytest.raises(TypeError, match="key must be a typed key"):
+        LEARNER.init(jax.random.PRNGKey(0))
+
+
+def test_a_model_of_another_size_fails(key):
+    """An ensemble for three observations cannot learn an environment with two."""
+    model = toys.small_ensemble(obs_size=3)
+    fitter = jaxpets.fit(model, optax.adam(1e-3), FitConfig())
+
+    def build_and_learn():
+        learner = jaxpets.learner(
+            ENV, model, fitter, BASELINE, trial_length=LENGTH, capacity=LENGTH
+        )
+        state = learner.init(key)
+        return learner.learn(key, state, toys.transitions(LENGTH))
+
+    with pytest.raises(ValueError, match=r"must be float32\[.*\], got float32\["):
+        jax.eval_shape(build_and_learn)
