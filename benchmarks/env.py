@@ -5,7 +5,7 @@ settings; both run random actions, from a state that was reached by random actio
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -26,9 +26,11 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every batch size, then one for C MuJoCo."""
     steps = 3 if args.tiny else args.steps
     for batch in [1] if args.tiny else args.batch:
-        result = time_mjx(batch, steps, args.repeats)
+        result = timing.repeat(*mjx_call(batch, steps), repeats=args.repeats)
         yield env_row("mjx", batch, steps, result)
-    yield env_row("mujoco", 1, 20 * steps, time_mujoco(20 * steps, args.repeats))
+    steps *= 20  # so that a run of the faster engine is not over at once
+    result = timing.repeat(mujoco_call(steps), repeats=args.repeats)
+    yield env_row("mujoco", 1, steps, result)
 
 
 def env_row(
@@ -45,8 +47,8 @@ def env_row(
     )
 
 
-def time_mjx(batch: int, steps: int, repeats: int) -> timing.Timing:
-    """Times `steps` steps of a batch of environments, in one program."""
+def mjx_call(batch: int, steps: int) -> tuple[Callable[[], Any], float]:
+    """Returns `steps` steps of a batch in one program, and its seconds of compiling."""
     env = half_cheetah.half_cheetah()
     keys = jax.random.split(jax.random.key(0), batch)
     shape = (steps, batch, half_cheetah.ACTION_SIZE)
@@ -60,30 +62,25 @@ def time_mjx(batch: int, steps: int, repeats: int) -> timing.Timing:
 
         return jax.lax.scan(step, state, actions)[0]
 
-    program, compile_s = timing.compile_program(
-        roll, jax.vmap(env.reset)(keys), actions
-    )
-    state = program(jax.vmap(env.reset)(keys), actions)
-    timing.seconds(lambda: program(state, actions))
-    times = [timing.seconds(lambda: program(state, actions)) for _ in range(repeats)]
-    return timing.summarize(times, compile_s)
+    start = jax.vmap(env.reset)(keys)
+    program, compile_s = timing.compile_program(roll, start, actions)
+    state = program(start, actions)
+    return lambda: program(state, actions), compile_s
 
 
-def time_mujoco(steps: int, repeats: int) -> timing.Timing:
-    """Times `steps` steps of one environment in C."""
+def mujoco_call(steps: int) -> Callable[[], None]:
+    """Returns `steps` steps of one environment in C, on one core."""
     model = half_cheetah.load_model()
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    step = mujoco.mj_step  # pyright: ignore[reportAttributeAccessIssue]
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, model.nu))
 
     def roll() -> None:
         for action in actions:
             data.ctrl[:] = action
-            mujoco.mj_step(  # pyright: ignore[reportAttributeAccessIssue]
-                model, data, nstep=FRAME_SKIP
-            )
+            step(model, data, nstep=FRAME_SKIP)
 
-    timing.seconds(roll)
-    return timing.summarize([timing.seconds(roll) for _ in range(repeats)])
+    return roll
 
 
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:

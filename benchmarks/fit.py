@@ -17,7 +17,7 @@ COLUMNS = ("seeds", "rows", "capacity", "updates", "compile_s", "min_ms", "media
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every number of seeds."""
-    size = workloads.SIZES["tiny" if args.tiny else "paper"]
+    size = workloads.named_size("tiny" if args.tiny else "paper")
     num_rows = 100 if args.tiny else args.rows
     capacity = max(num_rows, args.capacity or 0)
     fitter = workloads.fitter(size, args.epochs, args.batch_size)

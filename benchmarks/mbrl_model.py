@@ -1,7 +1,6 @@
 """The ensemble of mbrl-lib, trained by its own trainer on the data given."""
 
 import logging
-import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,13 +95,11 @@ def build(
     return Model(wrapper, trainer, batches)
 
 
-def train(model: Model, num_epochs: int) -> float:
-    """Trains for some epochs, without early stopping; returns the seconds it took."""
-    start = time.perf_counter()
+def train(model: Model, num_epochs: int) -> None:
+    """Trains for some epochs, without early stopping."""
     model.trainer.train(
         model.batches, num_epochs=num_epochs, evaluate=False, silent=True
     )
-    return time.perf_counter() - start
 
 
 def predict(model: Model, data: real_data.Arrays) -> tuple[np.ndarray, np.ndarray]:

@@ -43,18 +43,17 @@ def seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def summarize(times: list[float], compile_s: float = 0.0) -> Timing:
-    """Returns the Timing of runs given in seconds."""
-    median = statistics.median(times)
-    return Timing(compile_s, 1e3 * min(times), 1e3 * median, len(times))
+def repeat(call: Callable[[], Any], compile_s: float = 0.0, *, repeats: int) -> Timing:
+    """Runs something compiled once unmeasured and then `repeats` times."""
+    seconds(call)
+    times = [seconds(call) for _ in range(repeats)]
+    return Timing(compile_s, 1e3 * min(times), 1e3 * statistics.median(times), repeats)
 
 
 def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:
-    """Compiles `function`, runs it once unmeasured and then `repeats` times."""
+    """Compiles `function` for `args`, then runs it as `repeat` does."""
     compiled, compile_s = compile_program(function, *args)
-    seconds(lambda: compiled(*args))
-    times = [seconds(lambda: compiled(*args)) for _ in range(repeats)]
-    return summarize(times, compile_s)
+    return repeat(lambda: compiled(*args), compile_s, repeats=repeats)
 
 
 def compare(

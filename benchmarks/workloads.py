@@ -30,14 +30,30 @@ class Size:
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
 
 
-SIZES = {
-    "paper": Size(),
-    "laptop": Size(64, 10, 3, 15, 5),
-    "tiny": Size(16, 4, 2, 3, 5, hidden_sizes=(8, 8, 8, 8)),
-}
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
+
+
+def named_size(name: str) -> Size:
+    """Returns `paper`, `laptop` (the preset of the experiments) or `tiny`."""
+    if name == "tiny":
+        return Size(16, 4, 2, 3, 5, hidden_sizes=(8, 8, 8, 8))
+    if name == "paper":
+        return Size()
+    from experiments.config import preset  # needs the extra `experiments`
+
+    numbers = preset("laptop", "explore")
+    planner, network = numbers.planner, numbers.model
+    return Size(
+        num_samples=planner.num_samples,
+        num_elites=planner.num_elites,
+        num_iterations=planner.num_iterations,
+        horizon=planner.horizon,
+        num_particles=planner.num_particles,
+        num_members=network.num_members,
+        hidden_sizes=(network.hidden_size,) * network.num_layers,
+    )
 
 
 def add_size_flag(parser: argparse.ArgumentParser) -> None:
@@ -49,7 +65,7 @@ def add_size_flag(parser: argparse.ArgumentParser) -> None:
 
 def chosen_size(args: argparse.Namespace) -> Size:
     """Returns the size that `--size` and `--tiny` ask for."""
-    return SIZES["tiny" if args.tiny else args.size]
+    return named_size("tiny" if args.tiny else args.size)
 
 
 def model(size: Size, precision: str) -> jaxpets.Ensemble:
@@ -74,6 +90,16 @@ def rollout_fn(size: Size, precision: str) -> jaxpets.RolloutFn:
         num_members=size.num_members,
         num_particles=size.num_particles,
     )
+
+
+def rollout_work(size: Size, precision: str) -> tuple[jaxpets.RolloutFn, tuple]:
+    """Returns the rollout of one iteration of planning, and what it is called with."""
+    params_key, action_key, key = jax.random.split(jax.random.key(0), 3)
+    start = jax.jit(lambda key: params(size, key))(params_key)
+    shape = (size.num_samples, size.horizon, half_cheetah.ACTION_SIZE)
+    actions = jax.random.uniform(action_key, shape, jnp.float32, -1.0, 1.0)
+    obs = jnp.zeros((half_cheetah.OBS_SIZE,), jnp.float32)
+    return rollout_fn(size, precision), (start, key, obs, actions)
 
 
 def optimizer(size: Size, name: str) -> jaxpets.TrajectoryOptimizer:
