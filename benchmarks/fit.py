@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             size, fitter, keys, num_rows, capacity
         )
         result = timing.measure(
-            jax.vmap(fitter.step), params, keys, state, data, repeats=args.repeats
+            workloads.fit_seeds(fitter), params, keys, state, data, repeats=args.repeats
         )
         sizes = {
             "seeds": seeds,

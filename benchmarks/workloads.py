@@ -7,6 +7,8 @@ longer or shorter for other values.
 import argparse
 import dataclasses
 import itertools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,9 +43,9 @@ def named_size(name: str) -> Size:
         return Size(16, 4, 2, 3, 5, hidden_sizes=(8, 8, 8, 8))
     if name == "paper":
         return Size()
-    from experiments.config import preset  # needs the extra `experiments`
+    from experiments.config import PRESETS  # needs the extra `experiments`
 
-    numbers = preset("laptop", "explore")
+    numbers = PRESETS["laptop"]
     planner, network = numbers.planner, numbers.model
     return Size(
         num_samples=planner.num_samples,
@@ -174,7 +176,13 @@ def prepare_fit(
         start = params(size, model_key)
         return start, fitter.init(start), dataset(data_key, num_rows, capacity)
 
-    return jax.jit(jax.vmap(prepare))(keys)
+    axes = (0, 0, jaxpets.DATASET_AXES)
+    return jax.jit(jax.vmap(prepare, out_axes=axes))(keys)
+
+
+def fit_seeds(fitter: jaxpets.Fitter) -> Callable[..., Any]:
+    """Returns `fitter.step` mapped over seeds with equally many rows."""
+    return jax.vmap(fitter.step, (0, 0, 0, jaxpets.DATASET_AXES))
 
 
 def plan_params(size: Size, key: Array, reward: str) -> jaxpets.PlanParams:

@@ -11,18 +11,16 @@ from jax import Array
 
 import jaxpets
 from experiments.arms import NO_DATA, make_arm
-from experiments.config import Config
+from experiments.config import Config, PlannerNumbers
 from jaxpets.envs import half_cheetah
 
 # Every phase draws from its own stream of keys.
 EXPLORE, ZERO_SHOT, FINETUNE = 0, 1, 2
 
 
-# A learner over seeds: everything has the axis but the size of the dataset, which is
-# the same for all. Shared, it is the trip count of one plain loop over batches.
-LEARNER_AXES = jaxpets.LearnerState(
-    params=0, fit=0, dataset=jaxpets.Dataset(data=0, size=None, cursor=None), reward=0
-)  # type: ignore[arg-type]
+# A learner over seeds: all have equally many transitions.
+_MAPPED: Any = 0
+LEARNER_AXES = jaxpets.LearnerState(_MAPPED, _MAPPED, jaxpets.DATASET_AXES, _MAPPED)
 
 
 class Parts(NamedTuple):
@@ -46,45 +44,42 @@ def build(config: Config) -> Parts:
         weight_decays=_weight_decays(numbers.num_layers),
         state_margin=numbers.state_margin,
     )
-    trained = _ensemble(size)
-    precision = jaxpets.Precision(config.planner.precision)
-    planned = _ensemble(dataclasses.replace(size, precision=precision))
+    trained = _ensemble(size, jaxpets.Precision.TF32)
     fitter = jaxpets.fit(
         trained,
         optax.adam(config.training.learning_rate),
         jaxpets.FitConfig(config.training.num_epochs, config.training.batch_size),
     )
-    rollout = jaxpets.particle_rollout(
-        planned.sample,
-        num_members=numbers.num_members,
-        num_particles=config.planner.num_particles,
-    )
-    search = _optimizer(config, env)
+    planned = _ensemble(size, jaxpets.Precision(config.planner.precision))
     arm = make_arm(config, planned)
-    random = jaxpets.random_planner(env.action_low, env.action_high)
     explored = config.num_trials * config.trial_length
+    finetuned = config.finetune_trials * config.task_length
 
-    def learner(data: jaxpets.RewardData, capacity: int) -> jaxpets.Learner:
+    def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
+        model = _ensemble(size, jaxpets.Precision(search.precision))
+        rollout = jaxpets.particle_rollout(
+            model.sample,
+            num_members=numbers.num_members,
+            num_particles=search.num_particles,
+        )
+        return jaxpets.plan(rollout, reward_fn, _optimizer(search, env))
+
+    random = jaxpets.random_planner(env.action_low, env.action_high)
+
+    def learner(
+        data: jaxpets.RewardData, length: int, capacity: int
+    ) -> jaxpets.Learner:
         return jaxpets.learner(
-            env,
-            trained,
-            fitter,
-            data,
-            trial_length=config.trial_length,
-            capacity=capacity,
+            env, trained, fitter, data, trial_length=length, capacity=capacity
         )
 
     return Parts(
         env=env,
         random=random,
-        explorer=random
-        if arm.reward_fn is None
-        else jaxpets.plan(rollout, arm.reward_fn, search),
-        actor=jaxpets.plan(rollout, half_cheetah.task_reward, search),
-        learner=learner(arm.reward_data, explored),
-        finetuner=learner(
-            NO_DATA, explored + config.finetune_trials * config.trial_length
-        ),
+        explorer=planner(arm.reward_fn, config.planner) if arm.reward_fn else random,
+        actor=planner(half_cheetah.task_reward, config.task_planner),
+        learner=learner(arm.reward_data, config.trial_length, explored),
+        finetuner=learner(NO_DATA, config.task_length, explored + finetuned),
     )
 
 
@@ -102,9 +97,11 @@ def trial_keys(config: Config, phase: int, trial: int) -> Array:
     return jax.vmap(one)(jnp.stack([jax.random.key(s) for s in config.seeds]))
 
 
-def _ensemble(size: jaxpets.EnsembleConfig) -> jaxpets.Ensemble:
+def _ensemble(
+    size: jaxpets.EnsembleConfig, precision: jaxpets.Precision
+) -> jaxpets.Ensemble:
     return jaxpets.ensemble(
-        size,
+        dataclasses.replace(size, precision=precision),
         half_cheetah.model_space(),
         obs_size=half_cheetah.OBS_SIZE,
         action_size=half_cheetah.ACTION_SIZE,
@@ -118,9 +115,10 @@ def _weight_decays(num_layers: int) -> tuple[float, ...]:
     return (first, *inner, last)
 
 
-def _optimizer(config: Config, env: jaxpets.Env) -> jaxpets.TrajectoryOptimizer:
-    numbers = config.planner
-    shared = {
+def _optimizer(
+    numbers: PlannerNumbers, env: jaxpets.Env
+) -> jaxpets.TrajectoryOptimizer:
+    size = {
         "horizon": numbers.horizon,
         "action_low": env.action_low,
         "action_high": env.action_high,
@@ -128,8 +126,8 @@ def _optimizer(config: Config, env: jaxpets.Env) -> jaxpets.TrajectoryOptimizer:
         "num_iterations": numbers.num_iterations,
     }
     if numbers.optimizer == "mppi":
-        return jaxpets.mppi(**shared, temperature=numbers.temperature)
-    shared |= {"num_elites": numbers.num_elites, "momentum": numbers.momentum}
+        return jaxpets.mppi(**size, temperature=numbers.temperature)
+    size |= {"num_elites": numbers.num_elites, "momentum": numbers.momentum}
     if numbers.optimizer == "icem":
-        return jaxpets.icem(**shared, noise_beta=numbers.noise_beta)
-    return jaxpets.cem(**shared, legacy_variance=numbers.legacy_variance)
+        return jaxpets.icem(**size, noise_beta=numbers.noise_beta)
+    return jaxpets.cem(**size, legacy_variance=numbers.legacy_variance)

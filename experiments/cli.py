@@ -12,17 +12,9 @@ from typing import Any
 import tyro
 
 from experiments import rundir
-from experiments.config import Config, preset, validate
+from experiments.config import PRESETS, Config, validate
 from experiments.errors import CheckpointError, UsageError
 
-PRESETS = ("laptop", "paper", "smoke")
-ARMS = ("epistemic", "count", "random", "oracle", "one-step")
-
-# Where a later phase may differ from the run that it starts from.
-LATER = (
-    "phase", "task", "out", "name", "source", "at_trial", "video", "eval_trials",
-    "finetune_trials", "chunk_length", "milestones", "allow_cpu", "debug", "planner",
-)  # fmt: skip
 # Where a run that is continued may differ from its start.
 CONTINUED = ("out", "name", "video", "allow_cpu", "debug", "chunk_length", "source")
 
@@ -38,7 +30,7 @@ def parse(argv: Sequence[str]) -> Config:
       SystemExit: after `--help`.
     """
     first = _first_flags(argv)
-    default = preset(first.preset)
+    default = PRESETS[first.preset]
     if first.phase in ("zero-shot", "finetune"):
         default = _explored(first, default)
     config = _tyro(argv, default)
@@ -99,10 +91,13 @@ def from_json(data: dict[str, Any], default: Config) -> Config:
 def differences(
     old: dict[str, Any], new: dict[str, Any], ignore: Sequence[str]
 ) -> list[str]:
-    """Returns what differs between two configs in JSON, as `field: old vs new`."""
+    """Returns what differs between two configs in JSON, as `field: old vs new`.
+
+    An entry that only one of them has is of another version and cannot differ.
+    """
     lines = []
-    for name in sorted({*old, *new} - set(ignore)):
-        before, now = old.get(name), new.get(name)
+    for name in sorted({*old} & {*new} - set(ignore)):
+        before, now = old[name], new[name]
         if isinstance(before, dict) and isinstance(now, dict):
             lines += [f"{name}.{line}" for line in differences(before, now, ())]
         elif before != now:
@@ -164,7 +159,9 @@ def _tyro(argv: Sequence[str], default: Config) -> Config:
 
 def _one_line(text: str) -> str:
     """Shortens the boxed message of tyro to its words."""
-    text = text.split("For full helptext")[0].replace("Argument helptext:", "; it is")
+    text = text.partition("For full helptext")[0].replace(
+        "Argument helptext:", "; it is"
+    )
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line and not re.fullmatch(r"[-─━=╭╮╰╯ ]+", line)]
     return re.sub(r"\s+", " ", " ".join(lines[1:]) or text).strip()

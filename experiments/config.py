@@ -47,7 +47,7 @@ class TrainingNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class PlannerNumbers:
-    """The search at every step."""
+    """The search at every step; `planner` explores, `task_planner` performs tasks."""
 
     optimizer: Literal["cem", "icem", "mppi"] = "cem"
     """How action sequences are searched."""
@@ -108,7 +108,9 @@ class Config:
     random_trials: int = number(1, 1, 100_000)
     """Trials with random actions at the start."""
     trial_length: int = number(1000, 1, 1_000_000)
-    """Environment steps per trial."""
+    """Environment steps per exploration trial."""
+    task_length: int = number(1000, 1, 1_000_000)
+    """Environment steps per trial of zero-shot and finetune."""
     eval_trials: int = number(5, 1, 10_000)
     """zero-shot: trials per task and seed."""
     finetune_trials: int = number(20, 1, 10_000)
@@ -126,52 +128,62 @@ class Config:
     model: ModelNumbers = ModelNumbers()
     training: TrainingNumbers = TrainingNumbers()
     planner: PlannerNumbers = PlannerNumbers()
+    task_planner: PlannerNumbers = PlannerNumbers()
 
 
-def preset(name: Preset, phase: Any = tyro.MISSING) -> Config:
-    """Returns the numbers of a preset."""
-    if name == "paper":
-        return Config(phase, preset="paper")
-    if name == "laptop":
-        return Config(
-            phase,
-            preset="laptop",
-            num_trials=12,
-            trial_length=500,
-            eval_trials=1,
-            finetune_trials=3,
-            chunk_length=10,
-            training=TrainingNumbers(num_epochs=20, batch_size=64),
-            planner=PlannerNumbers(
-                optimizer="icem",
-                horizon=15,
-                num_samples=64,
-                num_elites=8,
-                num_iterations=3,
-                num_particles=5,
-                precision="f32",
-            ),
-        )
-    return Config(
-        phase,
+_LAPTOP_PLANNER = PlannerNumbers(
+    optimizer="icem",
+    horizon=20,
+    num_samples=64,
+    num_elites=8,
+    num_iterations=3,
+    num_particles=5,
+    precision="f32",
+)
+_SMOKE_PLANNER = PlannerNumbers(
+    horizon=3,
+    num_samples=8,
+    num_elites=2,
+    num_iterations=2,
+    num_particles=3,
+    precision="f32",
+)
+# The laptop plans about 20,000 and not 1,500,000 model steps an action with a network a
+# third as large, and trains longer on the little data there is. Many short trials beat
+# few long ones.
+PRESETS = {
+    "paper": Config(tyro.MISSING, preset="paper"),
+    "laptop": Config(
+        tyro.MISSING,
+        preset="laptop",
+        num_trials=48,
+        trial_length=250,
+        task_length=500,
+        eval_trials=1,
+        finetune_trials=3,
+        chunk_length=10,
+        milestones=(),
+        model=ModelNumbers(hidden_size=128, num_layers=3),
+        training=TrainingNumbers(num_epochs=20, batch_size=64),
+        planner=_LAPTOP_PLANNER,
+        task_planner=dataclasses.replace(_LAPTOP_PLANNER, horizon=15),
+    ),
+    "smoke": Config(
+        tyro.MISSING,
         preset="smoke",
         num_trials=3,
         trial_length=20,
+        task_length=20,
         eval_trials=1,
         finetune_trials=2,
         chunk_length=10,
         milestones=(),
         model=ModelNumbers(num_members=3, hidden_size=16, num_layers=2),
         training=TrainingNumbers(num_epochs=1, batch_size=16),
-        planner=PlannerNumbers(
-            horizon=3,
-            num_samples=8,
-            num_elites=2,
-            num_iterations=2,
-            num_particles=3,
-            precision="f32",
-        ),
-    )
+        planner=_SMOKE_PLANNER,
+        task_planner=_SMOKE_PLANNER,
+    ),
+}
 
 
 def validate(config: Config) -> None:
@@ -181,47 +193,47 @@ def validate(config: Config) -> None:
       UsageError: naming the flag, the value and what would be valid.
     """
     _check_ranges(config, "--")
-    planner, model = config.planner, config.model
     for seed in config.seeds:
         _require(0 <= seed < 2**32, "--seeds", seed, "0 to 4294967295")
     unique = 0 < len(config.seeds) == len(set(config.seeds))
     _require(unique, "--seeds", config.seeds, "one or more different seeds")
+    _check_planner("--planner", config.planner, config.model)
+    _check_planner("--task-planner", config.task_planner, config.model)
+    members = config.model.num_members
     _require(
-        planner.num_elites <= planner.num_samples or planner.optimizer == "mppi",
-        "--planner.num-elites",
-        planner.num_elites,
-        f"2 to --planner.num-samples ({planner.num_samples})",
-    )
-    _require(
-        planner.num_particles % model.num_members == 0,
-        "--planner.num-particles",
-        planner.num_particles,
-        f"a multiple of --model.num-members ({model.num_members})",
-    )
-    _require(
-        model.num_members >= 2 or config.arm not in ("epistemic", "one-step"),
+        members >= 2 or config.arm not in ("epistemic", "one-step"),
         "--model.num-members",
-        model.num_members,
+        members,
         f"2 or more for --arm {config.arm}; one member never disagrees",
     )
-    _require(
-        config.random_trials <= config.num_trials,
-        "--random-trials",
-        config.random_trials,
-        f"1 to --num-trials ({config.num_trials})",
-    )
-    _require(
-        config.trial_length % config.chunk_length == 0,
-        "--chunk-length",
-        config.chunk_length,
-        f"a divisor of --trial-length ({config.trial_length})",
-    )
+    random, trials = config.random_trials, config.num_trials
+    valid = f"1 to --num-trials ({trials})"
+    _require(random <= trials, "--random-trials", random, valid)
+    for length in (config.trial_length, config.task_length):
+        divides = length % config.chunk_length == 0
+        valid = f"a divisor of the length of a trial ({length})"
+        _require(divides, "--chunk-length", config.chunk_length, valid)
     if config.video is not None:
         good = config.video.suffix == ".mp4" and config.phase in (
             "zero-shot",
             "finetune",
         )
         _require(good, "--video", config.video, "a .mp4 file, in zero-shot or finetune")
+
+
+def _check_planner(flag: str, planner: PlannerNumbers, model: ModelNumbers) -> None:
+    _require(
+        planner.num_elites <= planner.num_samples or planner.optimizer == "mppi",
+        f"{flag}.num-elites",
+        planner.num_elites,
+        f"2 to {flag}.num-samples ({planner.num_samples})",
+    )
+    _require(
+        planner.num_particles % model.num_members == 0,
+        f"{flag}.num-particles",
+        planner.num_particles,
+        f"a multiple of --model.num-members ({model.num_members})",
+    )
 
 
 def _check_ranges(config: Any, prefix: str) -> None:

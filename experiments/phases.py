@@ -38,6 +38,7 @@ class Loop(NamedTuple):
     """What explore and finetune do not share."""
 
     what: str
+    trial_length: int
     keys: Callable[[int], Array]  # trial -> keys of the branches
     act: Callable[[int, State, Array, Tick], Trials]
     learn: Callable[[Array, State, jaxpets.Transition], tuple[State, Any]]
@@ -55,7 +56,9 @@ def explore(config: Config, folder: Path, say: Say) -> None:
     def act(trial: int, state: State, keys: Array, tick: Tick) -> Trials:
         actors = random if trial <= config.random_trials else planned
         params = jaxpets.PlanParams(state.params, state.reward)
-        return acting.run(actors, params, keys, _num_chunks(config), tick)
+        return acting.run(
+            actors, params, keys, config.trial_length // config.chunk_length, tick
+        )
 
     def labels(trial: int) -> list[dict[str, Any]]:
         planner = "random" if trial <= config.random_trials else "plan"
@@ -69,7 +72,7 @@ def explore(config: Config, folder: Path, say: Say) -> None:
     learn = jax.jit(over_seeds(parts.learner.learn), donate_argnums=1)
     keys = lambda trial: trial_keys(config, EXPLORE, trial)  # noqa: E731
     init = jax.jit(jax.vmap(parts.learner.init, out_axes=LEARNER_AXES))(keys(0))
-    loop = Loop("explore", keys, act, learn, labels)
+    loop = Loop("explore", config.trial_length, keys, act, learn, labels)
     trials = _run(config, folder, loop, init, 0, config.num_trials, say)
     if trials is not None:
         trials = jax.tree.map(lambda x: x[:, None, None], trials)
@@ -87,16 +90,17 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
     state = _explored(config, source, step, parts, say)
     names, weights = _tasks(config)
     actors = acting.performers(
-        parts.env, parts.actor, config.planner.horizon, config.chunk_length,
+        parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
         shared_model=True,
     )  # fmt: skip
     keys = _fan(trial_keys(config, ZERO_SHOT, step), _task_ids(names))
     keys = _fan(keys, range(config.eval_trials))
     params = jaxpets.PlanParams(state.params, weights)
-    progress = Progress(config.trial_length, 0, "zero-shot")
+    num_chunks = config.task_length // config.chunk_length
+    progress = Progress(config.task_length, 0, "zero-shot")
     begin = time.monotonic()
     with progress.interruptible():
-        trials = acting.run(actors, params, keys, _num_chunks(config), progress.tick)
+        trials = acting.run(actors, params, keys, num_chunks, progress.tick)
     records.check_finite(trials, step)
     common = {"phase": "zero-shot", "arm": config.arm, "explored_trials": step}
     labels = [
@@ -120,7 +124,7 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
     parts = build(config)
     names, weights = _tasks(config)
     actors = acting.performers(
-        parts.env, parts.actor, config.planner.horizon, config.chunk_length,
+        parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
         shared_model=False,
     )  # fmt: skip
 
@@ -128,7 +132,8 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
         del trial
         params = jaxpets.PlanParams(state.params, weights)
         keys = keys[..., None]
-        trials = acting.run(actors, params, keys, _num_chunks(config), tick)
+        num_chunks = config.task_length // config.chunk_length
+        trials = acting.run(actors, params, keys, num_chunks, tick)
         return jax.tree.map(lambda x: x[:, :, 0], trials)
 
     def labels(trial: int) -> list[dict[str, Any]]:
@@ -143,9 +148,10 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
     learn = jax.jit(learn, donate_argnums=1)
     keys = lambda trial: _fan(trial_keys(config, FINETUNE, trial), _task_ids(names))  # noqa: E731
     explored = _explored(config, source, step, parts, say)
-    capacity = (config.num_trials + config.finetune_trials) * config.trial_length
+    capacity = explored.dataset.data.obs.shape[1]
+    capacity += config.finetune_trials * config.task_length
     init = _branch(explored, len(names), capacity)
-    loop = Loop("finetune", keys, act, learn, labels)
+    loop = Loop("finetune", config.task_length, keys, act, learn, labels)
     last = step + config.finetune_trials
     trials = _run(config, folder, loop, init, step, last, say)
     if trials is not None:
@@ -165,7 +171,7 @@ def _run(
     if done >= last:
         say(f"already complete: {last - first} of {last - first} trials.")
         return None
-    steps = config.trial_length
+    steps = loop.trial_length
     progress = Progress((last - first) * steps, (done - first) * steps, loop.what)
     trials = None
     with progress.interruptible():
@@ -218,10 +224,10 @@ def _branch(state: State, num_tasks: int, capacity: int) -> State:
     return jax.tree.map(repeat, state)
 
 
-def _tasks(config: Config) -> tuple[list[str], half_cheetah.TaskWeights]:
+def _tasks(config: Config) -> tuple[Sequence[str], half_cheetah.TaskWeights]:
     """Returns the names of the tasks and their weights `[K]`."""
     every = config.task == "all"
-    names = list(half_cheetah.TASK_NAMES) if every else [config.task]
+    names = [*half_cheetah.TASK_NAMES] if every else [str(config.task)]
     ids = jnp.asarray(_task_ids(names))
     return names, jax.tree.map(lambda x: x[ids], half_cheetah.tasks())
 
@@ -242,10 +248,6 @@ def _fan(keys: Array, ids: Sequence[int]) -> Array:
 def _split(keys: Array) -> tuple[Array, Array]:
     pairs = jax.vmap(jax.random.split)(keys.reshape(-1)).reshape(*keys.shape, 2)
     return pairs[..., 0], pairs[..., 1]
-
-
-def _num_chunks(config: Config) -> int:
-    return config.trial_length // config.chunk_length
 
 
 def _summary(rows: list[dict[str, Any]], names: Sequence[str], time: str) -> str:

@@ -148,8 +148,9 @@ def _plain_errors(config: Config) -> Iterator[None]:
 
 
 def _memory_advice(config: Config) -> str:
-    planner = config.planner
-    trials = config.eval_trials if config.phase == "zero-shot" else 1
+    exploring = config.phase == "explore"
+    planner = config.planner if exploring else config.task_planner
+    trials = 4 * config.eval_trials if config.phase == "zero-shot" else 1
     return (
         f"out of memory. {len(config.seeds)} seeds x {trials} trials x "
         f"{planner.num_samples} samples x {planner.num_particles} particles x horizon "

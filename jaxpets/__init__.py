@@ -2,7 +2,7 @@
 
 from jaxpets import rewards
 from jaxpets._src.cem import CEMState, cem
-from jaxpets._src.dataset import append, grow, init_dataset
+from jaxpets._src.dataset import DATASET_AXES, append, grow, init_dataset
 from jaxpets._src.ensemble import (
     Ensemble,
     EnsembleConfig,
@@ -40,6 +40,7 @@ from jaxpets._src.unroll import UnrollState, start, unroll
 __version__ = "0.1.0"
 
 __all__ = [
+    "DATASET_AXES",
     "WORST_VALUE",
     "CEMState",
     "Dataset",

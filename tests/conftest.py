@@ -32,6 +32,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skips what needs a GPU where there is none."""
     if any(device.platform == "gpu" for device in jax.devices()):
+        # The others stay on the CPU; the marked ones ask for the GPU.
+        jax.config.update("jax_default_device", jax.devices("cpu")[0])
         return
     skip = pytest.mark.skip(reason="needs a GPU")
     for item in items:

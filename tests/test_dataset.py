@@ -64,6 +64,39 @@ def test_eager_append_keeps_the_avals():
     assert toys.avals(jaxpets.append(dataset, numbered(0, 3))) == toys.avals(dataset)
 
 
+@pytest.mark.parametrize("count", [0, 5, 8, 11])
+def test_growing_keeps_every_row_and_the_oldest_goes_first(count):
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    for first in range(count):
+        dataset = jaxpets.append(dataset, numbered(first, 1))
+    grown = jaxpets.grow(dataset, 12)
+    assert grown.data.obs.shape == (12, 2) and grown.size == dataset.size
+    rows = list(range(max(0, count - CAPACITY), count))
+    np.testing.assert_array_equal(grown.data.obs[: len(rows), 0], rows)
+    assert held(grown) == rows
+    # It is a ring of the new capacity: filled to one past it, the oldest row is lost.
+    room = 12 - len(rows)
+    full = jaxpets.append(grown, numbered(count, room))
+    rows += range(count, count + room)
+    assert held(full) == rows
+    assert held(jaxpets.append(full, numbered(count + room, 1))) == [
+        *rows[1:],
+        count + room,
+    ]
+    assert toys.avals(grown.size) == toys.avals(dataset.size)
+    assert toys.avals(grown.cursor) == toys.avals(dataset.cursor)
+
+
+def test_growing_to_the_same_capacity_keeps_the_rows():
+    dataset = jaxpets.append(jaxpets.init_dataset(CAPACITY, 2, 1), numbered(0, 8))
+    toys.assert_trees_close(jaxpets.grow(dataset, CAPACITY), dataset, rtol=0)
+
+
+def test_a_dataset_does_not_shrink():
+    with pytest.raises(ValueError, match="capacity must be at least 8, got 7"):
+        jaxpets.grow(jaxpets.init_dataset(CAPACITY, 2, 1), 7)
+
+
 def test_too_many_rows_fail():
     dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
     with pytest.raises(ValueError, match="capacity of 8, got 9 rows"):

@@ -135,7 +135,8 @@ def test_variance_stays_between_its_bounds(model, params):
         last = dict(stack["layer_2"], bias=jnp.full((E, 2 * D), raw))
         members = {"params": dict(stack, layer_2=last)}
         network = params.network._replace(members=members)
-        _, variance = model.predict(params._replace(network=network), *batch())
+        bent = params._replace(network=network)
+        _, variance = jax.jit(model.predict)(bent, *batch())
         low, high = params.network.min_logvar, params.network.max_logvar
         want = reference.bound_logvar(np.float64(raw), np.float64(low), high)
         want = np.broadcast_to(np.exp(want), variance.shape)
@@ -170,8 +171,8 @@ def test_precision_changes_results_little_and_parameters_not(precision, params):
     other = toys.small_ensemble(precision=precision)
     inits = [jax.jit(m.init)(jax.random.key(0)) for m in (exact, other)]
     toys.assert_trees_close(inits[0], inits[1], rtol=0)
-    mean, variance = exact.predict(params, *batch())
-    got_mean, got_variance = other.predict(params, *batch())
+    mean, variance = jax.jit(exact.predict)(params, *batch())
+    got_mean, got_variance = jax.jit(other.predict)(params, *batch())
     assert got_mean.dtype == got_variance.dtype == jnp.float32
     # bfloat16 keeps 8 bits; three layers.
     np.testing.assert_allclose(got_mean, mean, atol=0.1)
@@ -210,7 +211,8 @@ def test_scaler_equals_the_reference_on_the_rows_in_use(model):
 def test_scaler_of_nothing_is_the_identity(model):
     empty = jaxpets.init_dataset(8, D, A)
     scaler = model.fit_scaler(empty.data, empty.size)
-    toys.assert_trees_close(scaler, model.init(jax.random.key(0)).scaler, rtol=0)
+    untrained = jax.jit(model.init)(jax.random.key(0))
+    toys.assert_trees_close(scaler, untrained.scaler, rtol=0)
 
 
 def test_encode_equals_the_reference(model, params):
@@ -238,14 +240,12 @@ def test_sample_has_the_predicted_law(params):
     model = toys.small_ensemble(state_margin=None)
     row = batch()[0][:, :1]
     obs, action = jnp.broadcast_to(row, (E, 20_000, D)), jnp.zeros((20_000, A))
-    mean, variance = model.predict(params, row, action[:1])
+    mean, variance = jax.jit(model.predict)(params, row, action[:1])
     drawn = jax.jit(model.sample)(params, jax.random.key(5), obs, action)
     std = np.sqrt(variance[:, 0])
     # 20,000 draws: the mean is known to 0.7 % of the deviation, the variance to 1 %.
     np.testing.assert_array_less(np.abs(drawn.mean(1) - mean[:, 0]), 0.04 * std)
     np.testing.assert_allclose(drawn.std(1), std, rtol=0.04)
-    correlation = np.corrcoef(drawn.reshape(E, -1))
-    np.testing.assert_allclose(correlation, np.eye(E), atol=1.0)
     residual = np.asarray(drawn - mean).reshape(E, -1)
     np.testing.assert_allclose(np.corrcoef(residual), np.eye(E), atol=0.03)
 
@@ -292,7 +292,7 @@ def test_before_any_data_there_is_no_bound(margin):
     model = toys.small_ensemble(state_margin=margin)
     params = jax.jit(model.init)(jax.random.key(0))
     obs, action = batch()
-    drawn = model.sample(params, jax.random.key(1), 1e3 * obs, action)
+    drawn = jax.jit(model.sample)(params, jax.random.key(1), 1e3 * obs, action)
     assert jnp.all(jnp.isfinite(drawn))
     assert jnp.max(jnp.abs(drawn)) > 100
 
@@ -315,9 +315,17 @@ def test_margin_zero_keeps_to_the_range_of_the_data():
         (dict(hidden_sizes=(200, 0, 1, 1)), ValueError, "hidden_sizes must be at leas"),
         (dict(hidden_sizes=200), TypeError, "hidden_sizes must be .*200"),
         (dict(hidden_sizes=(200,)), ValueError, r"weight_decays must have .*\(2\).* 5"),
-        (dict(weight_decays=(1.0, 1.0, 1.0, 1.0, -1.0)), ValueError, "weight_decays mu"),
+        (
+            dict(weight_decays=(1.0, 1.0, 1.0, 1.0, -1.0)),
+            ValueError,
+            "weight_decays mu",
+        ),
         (dict(bound_decay=-0.1), ValueError, "bound_decay must be in"),
-        (dict(precision="bf16"), TypeError, "precision must be a Precision, got 'bf16'"),
+        (
+            dict(precision="bf16"),
+            TypeError,
+            "precision must be a Precision, got 'bf16'",
+        ),
         (dict(state_margin=-1.0), ValueError, "state_margin must be in"),
     ],
 )

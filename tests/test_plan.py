@@ -137,11 +137,10 @@ def test_scalar_and_per_particle_rewards_agree(key):
         return jnp.broadcast_to(jnp.sum(action), obs.shape[:-1])
 
     planners = [
-        jaxpets.plan(ROLLOUT, fn, toys.optimizer("cem")) for fn in (scalar, per_particle)
+        jaxpets.plan(ROLLOUT, fn, toys.optimizer("cem"))
+        for fn in (scalar, per_particle)
     ]
-    outs = [
-        jax.jit(p.step)(PARAMS, key, p.init(), jnp.zeros(2))[0] for p in planners
-    ]
+    outs = [jax.jit(p.step)(PARAMS, key, p.init(), jnp.zeros(2))[0] for p in planners]
     # The mean of equal numbers may differ from them by rounding.
     toys.assert_trees_close(outs[0], outs[1], rtol=1e-5, atol=1e-6)
 

@@ -5,7 +5,11 @@ import numpy as np
 import pytest
 import reference
 import toys
-from jaxpets.rewards import count_states, lookup, pseudo_count, simhash
+from jaxpets.rewards import pseudo_count, simhash
+
+# Jitted once; the tests keep to a few sizes, for sorts are slow to compile.
+count_states = jax.jit(jaxpets.rewards.count_states)
+lookup = jax.jit(jaxpets.rewards.lookup)
 
 SIZE, CAPACITY, D = 300, 512, 6
 
@@ -39,11 +43,11 @@ def test_counts_equal_a_dictionary(num_bits):
     projection = np.asarray(simhash(jax.random.key(num_bits), num_bits, D))
     want = reference.DictCounts(projection, states)
     assert margin(want, states) > 1e-5 and margin(want, queries) > 1e-5
-    counts = jax.jit(count_states)(jnp.asarray(projection), dataset_of(states))
-    got = jax.jit(lookup)(counts, jnp.asarray(queries))
+    counts = count_states(jnp.asarray(projection), dataset_of(states))
+    got = lookup(counts, jnp.asarray(queries))
     assert got.dtype == jnp.int32
     np.testing.assert_array_equal(got, [want.count(query) for query in queries])
-    bonus = pseudo_count(counts, None, None, jnp.asarray(queries))
+    bonus = jax.jit(pseudo_count)(counts, None, None, jnp.asarray(queries))
     # The reciprocal root is good to 1e-6 in float32.
     np.testing.assert_allclose(bonus, [want.bonus(q) for q in queries], rtol=1e-5)
 
@@ -87,9 +91,11 @@ def test_bit_31_counts():
 def test_bonus_falls_with_the_root_of_visits():
     other = np.float32([[-1.0, 2.0]])
     for visits in (1, 3, 24):
-        states = np.concatenate([np.repeat(np.float32([[2.0, -1.0]]), visits, 0), other])
+        states = np.concatenate(
+            [np.repeat(np.float32([[2.0, -1.0]]), visits, 0), other]
+        )
         counts = count_states(simhash(jax.random.key(0), 16, 2), dataset_of(states))
-        bonus = pseudo_count(counts, None, None, states[:1])
+        bonus = jax.jit(pseudo_count)(counts, None, None, states[:1])
         np.testing.assert_allclose(bonus, 1 / np.sqrt(1 + visits), rtol=1e-5)
 
 

@@ -81,7 +81,9 @@ def test_epistemic_passes_on_what_diverged():
 
 def test_epistemic_refuses_what_does_not_fit():
     states, base = particles()
-    with pytest.raises(ValueError, match=r"baseline_variance must be float32\[6\], got"):
+    with pytest.raises(
+        ValueError, match=r"baseline_variance must be float32\[6\], got"
+    ):
         reward(states, base[:3])
     with pytest.raises(ValueError, match=r"next_obs must be float32\[E, P, D\], got"):
         reward(states[0], base)
@@ -122,13 +124,15 @@ def test_one_step_disagreement_is_zero_for_members_that_agree():
 
 def test_one_step_disagreement_with_the_ensemble(key):
     model = toys.small_ensemble()
-    params = model.init(key)
-    fn = one_step_disagreement(model.predict)
+    params = jax.jit(model.init)(key)
+    fn = jax.jit(one_step_disagreement(model.predict))
     obs = jax.random.normal(key, (3, 2, 2))
     got = fn(params, obs, jnp.ones(1), obs)
     # All six particles as the rows of every member.
     rows = jnp.broadcast_to(obs.reshape(6, 2), (3, 6, 2))
-    mean, variance = (np.float64(x) for x in model.predict(params, rows, jnp.ones((6, 1))))
+    mean, variance = (
+        np.float64(x) for x in jax.jit(model.predict)(params, rows, jnp.ones((6, 1)))
+    )
     want = np.sqrt(mean.var(0) / variance.mean(0)).mean(-1)
     np.testing.assert_allclose(got, want.reshape(3, 2), rtol=1e-4)
 

@@ -49,9 +49,7 @@ def test_equals_trajectory_sampling_of_the_reference():
 
 def test_index_zero_is_the_start():
     path, obs, _ = rolled()
-    np.testing.assert_array_equal(
-        path[:, 0], np.broadcast_to(obs, path[:, 0].shape)
-    )
+    np.testing.assert_array_equal(path[:, 0], np.broadcast_to(obs, path[:, 0].shape))
 
 
 def test_every_particle_has_its_own_noise_at_every_step():
@@ -62,7 +60,9 @@ def test_every_particle_has_its_own_noise_at_every_step():
 
 def test_members_are_fixed_and_have_equally_many_particles():
     def who(params, key, obs, action):
-        return jnp.broadcast_to(jnp.arange(E, dtype=jnp.float32)[:, None, None], obs.shape)
+        return jnp.broadcast_to(
+            jnp.arange(E, dtype=jnp.float32)[:, None, None], obs.shape
+        )
 
     rollout = jaxpets.particle_rollout(who, num_members=E, num_particles=E * P)
     path = rollout((), jax.random.key(0), jnp.zeros(1), jnp.zeros((N, H, 1)))
@@ -120,7 +120,9 @@ def test_bad_counts_fail_when_built():
 
 def test_wrong_arguments_fail_when_traced(key):
     rollout = jaxpets.particle_rollout(toys.cart)
-    with pytest.raises(ValueError, match=r"obs must be float32\[D\], got float32\[3, 2"):
+    with pytest.raises(
+        ValueError, match=r"obs must be float32\[D\], got float32\[3, 2"
+    ):
         rollout(1.0, key, jnp.zeros((3, 2)), jnp.zeros((N, H, 1)))
     with pytest.raises(ValueError, match=r"actions must be float32\[N, H, A\], got"):
         rollout(1.0, key, jnp.zeros(2), jnp.zeros((H, 1)))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 
 def check_count(name: str, value: Any, minimum: int = 1) -> None:
@@ -60,7 +61,7 @@ def check_action_box(action_low: Array, action_high: Array) -> None:
     check_array("action_low", action_low, ["A"])
     check_array("action_high", action_high, [jnp.shape(action_low)[0]])
     bounds = (action_low, action_high)
-    if any(isinstance(bound, jax.core.Tracer) for bound in bounds):
+    if any(isinstance(bound, Tracer) for bound in bounds):
         return
     low, high = np.asarray(action_low), np.asarray(action_high)
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):

@@ -169,7 +169,7 @@ def ensemble(
     feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
     input_size = feature_size + action_size
     network = _Network(config.hidden_sizes, 2 * obs_size, config.precision)
-    apply_members = jax.vmap(network.apply)
+    apply_members: Callable[[Any, Array], Array] = jax.vmap(network.apply)  # pyright: ignore
 
     def init(key: Array) -> EnsembleParams:
         keys = jax.random.split(key, config.num_members)
@@ -181,7 +181,8 @@ def ensemble(
         return EnsembleParams(NetworkParams(members, zeros - 10.0, zeros + 0.5), scaler)
 
     def forward(network: NetworkParams, inputs: Array) -> tuple[Array, Array]:
-        mean, raw = jnp.split(apply_members(network.members, inputs), 2, axis=-1)
+        outputs = apply_members(network.members, inputs)
+        mean, raw = jnp.split(outputs, 2, axis=-1)
         low, high = network.min_logvar, network.max_logvar
         logvar = high - jax.nn.softplus(high - raw)
         return mean, low + jax.nn.softplus(logvar - low)

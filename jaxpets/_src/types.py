@@ -71,7 +71,7 @@ class EnvState(NamedTuple):
 class DynamicsFn(Protocol):
     """A model that moves particles by one step."""
 
-    def __call__(self, params: Any, key: Array, obs: Array, action: Array) -> Array:
+    def __call__(self, params: Any, key: Array, obs: Array, action: Array, /) -> Array:
         """Samples the next observation of every particle, each with its own member.
 
         Args:
@@ -89,7 +89,7 @@ class DynamicsFn(Protocol):
 class RolloutFn(Protocol):
     """An imagination: action sequences in, observation paths out."""
 
-    def __call__(self, params: Any, key: Array, obs: Any, actions: Array) -> Array:
+    def __call__(self, params: Any, key: Array, obs: Any, actions: Array, /) -> Array:
         """Rolls N action sequences out from one start.
 
         Args:
@@ -108,7 +108,7 @@ class RewardFn(Protocol):
     """A reward of one imagined step of one candidate, given its whole particle set."""
 
     def __call__(
-        self, params: Any, obs: Array, action: Array, next_obs: Array
+        self, params: Any, obs: Array, action: Array, next_obs: Array, /
     ) -> Array:
         """Rewards one step.
 
@@ -127,7 +127,7 @@ class RewardFn(Protocol):
 class ObjectiveFn(Protocol):
     """The function a trajectory optimizer maximises."""
 
-    def __call__(self, key: Array, actions: Array) -> Array:
+    def __call__(self, key: Array, actions: Array, /) -> Array:
         """Values `[N]` of sequences `[N, H, A]`: higher is better, always finite."""
         ...
 

@@ -8,7 +8,7 @@ the same state; nothing ends a trial; all geoms hit the floor (not so in Brax).
 import contextlib
 import importlib.resources
 import io
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import jax
@@ -137,7 +137,7 @@ def model_space() -> ModelSpace:
     )
 
 
-def load_model() -> mujoco.MjModel:
+def load_model() -> Any:
     """Returns gymnasium's HalfCheetah as a compiled MuJoCo model."""
     assets = importlib.resources.files("gymnasium.envs.mujoco") / "assets"
     root = ElementTree.fromstring((assets / "half_cheetah.xml").read_text())
@@ -147,7 +147,8 @@ def load_model() -> mujoco.MjModel:
     for name in ("settotalmass", "coordinate"):
         compiler.attrib.pop(name, None)
     geom.set("density", _DENSITY)
-    return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, "unicode"))
+    xml = ElementTree.tostring(root, "unicode")
+    return mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
