@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Parses the flags, measures and reports."""
     parser = rows.parser(__doc__)
     parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1, 4, 16])
-    parser.add_argument("--rows", type=rows.positive, default=3000, help="of data")
+    parser.add_argument("--rows", type=rows.positive, default=10_000, help="of data")
     parser.add_argument(
         "--capacity", type=rows.positive, help="of the dataset; as many as rows if less"
     )

@@ -182,7 +182,16 @@ def prepare_fit(
 
 def fit_seeds(fitter: jaxpets.Fitter) -> Callable[..., Any]:
     """Returns `fitter.step` mapped over seeds with equally many rows."""
-    return jax.vmap(fitter.step, (0, 0, 0, jaxpets.DATASET_AXES))
+    many = jax.vmap(fitter.step, (0, 0, 0, jaxpets.DATASET_AXES))
+
+    def step(params: Any, keys: Array, state: Any, data: jaxpets.Dataset) -> Any:
+        if len(keys) > 1:
+            return many(params, keys, state, data)
+        # An axis of one would cost a third more, and nobody trains one seed so.
+        first = jax.tree.map(lambda x: x[0] if x.ndim else x, (params, state, data))
+        return fitter.step(first[0], keys[0], *first[1:])
+
+    return step
 
 
 def plan_params(size: Size, key: Array, reward: str) -> jaxpets.PlanParams:

@@ -14,6 +14,9 @@ from experiments.arms import NO_DATA, make_arm
 from experiments.config import Config, PlannerNumbers
 from jaxpets.envs import half_cheetah
 
+State = jaxpets.LearnerState
+Learn = Callable[[Array, State, jaxpets.Transition], tuple[State, Any]]
+
 # Every phase draws from its own stream of keys.
 EXPLORE, ZERO_SHOT, FINETUNE = 0, 1, 2
 
@@ -83,9 +86,25 @@ def build(config: Config) -> Parts:
     )
 
 
-def over_seeds(learn: Callable[..., Any]) -> Callable[..., Any]:
-    """Maps `Learner.learn` over one more leading axis of everything."""
-    return jax.vmap(learn, (0, LEARNER_AXES, 0), (LEARNER_AXES, 0))
+def over_seeds(learn: Learn, num_seeds: int) -> Learn:
+    """Maps `Learner.learn` over one more leading axis of everything.
+
+    An axis of one is left out: XLA does not simplify gathers over it, and training
+    would take a third longer on a GPU.
+    """
+    if num_seeds > 1:
+        return jax.vmap(learn, (0, LEARNER_AXES, 0), (LEARNER_AXES, 0))
+
+    def learn_one(keys: Array, state: State, transitions: jaxpets.Transition) -> Any:
+        state, transitions = jax.tree.map(
+            lambda x: x[0] if x.ndim else x, (state, transitions)
+        )
+        state, fit = learn(keys[0], state, transitions)
+        sizes = {name: getattr(state.dataset, name) for name in ("size", "cursor")}
+        state, fit = jax.tree.map(lambda x: x[None], (state, fit))
+        return state._replace(dataset=state.dataset._replace(**sizes)), fit
+
+    return learn_one
 
 
 def trial_keys(config: Config, phase: int, trial: int) -> Array:

@@ -21,7 +21,9 @@ from experiments.build import (
     FINETUNE,
     LEARNER_AXES,
     ZERO_SHOT,
+    Learn,
     Parts,
+    State,
     build,
     over_seeds,
     trial_keys,
@@ -31,7 +33,6 @@ from experiments.progress import Progress
 from jaxpets.envs import half_cheetah
 
 Say = Callable[[str], None]
-State = jaxpets.LearnerState
 
 
 class Loop(NamedTuple):
@@ -41,7 +42,7 @@ class Loop(NamedTuple):
     trial_length: int
     keys: Callable[[int], Array]  # trial -> keys of the branches
     act: Callable[[int, State, Array, Tick], Trials]
-    learn: Callable[[Array, State, jaxpets.Transition], tuple[State, Any]]
+    learn: Learn
     labels: Callable[[int], list[dict[str, Any]]]  # of the branches
 
 
@@ -69,7 +70,9 @@ def explore(config: Config, folder: Path, say: Say) -> None:
             for seed in config.seeds
         ]
 
-    learn = jax.jit(over_seeds(parts.learner.learn), donate_argnums=1)
+    learn = jax.jit(
+        over_seeds(parts.learner.learn, len(config.seeds)), donate_argnums=1
+    )
     keys = lambda trial: trial_keys(config, EXPLORE, trial)  # noqa: E731
     init = jax.jit(jax.vmap(parts.learner.init, out_axes=LEARNER_AXES))(keys(0))
     loop = Loop("explore", config.trial_length, keys, act, learn, labels)
@@ -144,7 +147,8 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
             for task in names
         ]
 
-    learn = over_seeds(over_seeds(parts.finetuner.learn))
+    learn = over_seeds(parts.finetuner.learn, len(names))
+    learn = over_seeds(learn, len(config.seeds))
     learn = jax.jit(learn, donate_argnums=1)
     keys = lambda trial: _fan(trial_keys(config, FINETUNE, trial), _task_ids(names))  # noqa: E731
     explored = _explored(config, source, step, parts, say)

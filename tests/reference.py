@@ -37,24 +37,6 @@ def cem_update(mean, variance, samples, values, num_elites, momentum, *, legacy=
     return new_mean, new_variance
 
 
-def cem_search(mean, variance, noise, value_fn, low, high, settings, *, legacy=False):
-    """Whole search on given standard truncated-normal noise, one array an iteration.
-
-    Stops, as in 2018, when the largest variance is down to `min_variance`.
-    """
-    num_elites, momentum, min_variance = settings
-    for unit in noise:
-        if variance.max() <= min_variance:
-            break
-        std = np.sqrt(constrained_variance(mean, variance, low, high))
-        samples = mean + std * unit
-        values = [value_fn(sample) for sample in samples]
-        mean, variance = cem_update(
-            mean, variance, samples, values, num_elites, momentum, legacy=legacy
-        )
-    return mean, variance
-
-
 def shift(mean, fill):
     """Warm start: the plan moved by one step, its last step filled."""
     return np.concatenate([mean[1:], np.broadcast_to(fill, mean[:1].shape)])

@@ -3,10 +3,11 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import toys
+
+import jaxpets
 from jaxpets import PlanParams
 from jaxpets.envs import env_rollout, from_brax
 

@@ -1,10 +1,10 @@
-import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import reference
 from toys import record
+
+import jaxpets
 
 ONE = jnp.ones(2)
 # A box that is neither symmetric nor square.

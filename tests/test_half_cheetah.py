@@ -1,13 +1,12 @@
-import math
-
 import gymnasium
 import jax
 import jax.numpy as jnp
-import jaxpets
 import mujoco
 import numpy as np
 import pytest
-import reference
+from c_mujoco import c_step, visited_states
+
+import jaxpets
 from jaxpets.envs import half_cheetah as hc
 from jaxpets.envs.half_cheetah import Physics
 
@@ -57,56 +56,9 @@ def env_states(qpos, qvel, warmstart=None):
 # -- parity --------------------------------------------------------------------------
 
 
-def visited_states(model, seed=0):
-    """Half upright, half tumbled: qpos, qvel, qacc_warmstart, each `[500, 9]`.
-
-    A tumbled cheetah was dropped in a random posture and has come down on whatever
-    came first; both halves act at random all the while, some weakly, so that they lie.
-    """
-    rng = np.random.default_rng(seed)
-    data = mujoco.MjData(model)
-    rows = []
-    for i in range(STATES):
-        mujoco.mj_resetData(model, data)
-        tumbled = i >= STATES // 2
-        if tumbled:
-            data.qpos[1] = rng.uniform(0.2, 0.8)
-            data.qpos[2] = rng.uniform(-math.pi, math.pi)
-            low, high = model.jnt_range[3:].T
-            data.qpos[3:] = rng.uniform(low, high)
-            data.qvel[:] = rng.normal(size=9)
-        else:
-            data.qpos[:] += 0.001 * rng.normal(size=9)
-            data.qvel[:] = 0.001 * rng.normal(size=9)
-        strength = rng.uniform(0, 1)
-        for _ in range(rng.integers(20, 60)):
-            data.ctrl[:] = strength * rng.uniform(-1, 1, 6)
-            mujoco.mj_step(model, data, 5)
-        rows.append(np.stack([data.qpos, data.qvel, data.qacc_warmstart]))
-    return np.stack(rows, axis=1).astype(np.float32)
-
-
-def c_step(model, qpos, qvel, warmstart, actions):
-    """One environment step in double precision from each state, and its contacts."""
-    data = mujoco.MjData(model)
-    after, contacts = [], []
-    for i in range(len(qpos)):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
-        data.qacc_warmstart[:] = warmstart[i]
-        data.ctrl[:] = actions[i]
-        seen = 0
-        for _ in range(5):
-            mujoco.mj_step(model, data)
-            seen = max(seen, data.ncon)
-        contacts.append(seen)
-        after.append(np.stack([data.qpos, data.qvel]))
-    return np.stack(after, axis=1), np.array(contacts)
-
-
 def errors_against_c(model, run):
     """Largest |dqpos| and |dqvel| of each state after one environment step."""
-    qpos, qvel, warmstart = visited_states(model)
+    qpos, qvel, warmstart = visited_states(model, STATES)
     actions = np.random.default_rng(1).uniform(-1, 1, (STATES, 6)).astype(np.float32)
     # The cases are those meant: on the back or the side, and touching the floor.
     want, contacts = c_step(model, qpos, qvel, warmstart, actions)
@@ -151,7 +103,7 @@ def test_one_step_equals_c_mujoco_on_the_gpu(gym_model, env):
 
 
 def test_ten_steps_stay_beside_c_mujoco(gym_model, step):
-    qpos, qvel, warmstart = visited_states(gym_model, seed=3)
+    qpos, qvel, warmstart = visited_states(gym_model, 80, seed=3)
     pick = slice(0, 40)  # upright
     state = env_states(qpos[pick], qvel[pick], warmstart[pick])
     data = mujoco.MjData(gym_model)
@@ -176,10 +128,31 @@ def test_ten_steps_stay_beside_c_mujoco(gym_model, step):
 def test_constants_equal_gymnasiums(gym_model):
     model = hc.load_model()
     assert (model.nq, model.nv, model.nu, model.ngeom) == (9, 9, 6, gym_model.ngeom)
-    fields = """body_mass body_inertia body_ipos body_pos geom_size geom_pos geom_quat
-        geom_friction geom_contype geom_conaffinity geom_solref geom_solimp jnt_axis
-        jnt_range jnt_stiffness jnt_pos dof_damping dof_armature dof_invweight0
-        actuator_gear actuator_ctrlrange qpos0 qpos_spring""".split()
+    fields = [
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "body_pos",
+        "geom_size",
+        "geom_pos",
+        "geom_quat",
+        "geom_friction",
+        "geom_contype",
+        "geom_conaffinity",
+        "geom_solref",
+        "geom_solimp",
+        "jnt_axis",
+        "jnt_range",
+        "jnt_stiffness",
+        "jnt_pos",
+        "dof_damping",
+        "dof_armature",
+        "dof_invweight0",
+        "actuator_gear",
+        "actuator_ctrlrange",
+        "qpos0",
+        "qpos_spring",
+    ]
     for field in fields:
         want = getattr(gym_model, field)
         np.testing.assert_allclose(
@@ -312,106 +285,3 @@ def test_positions_follow_from_a_recorded_trial(step):
     got = hc.qpos_from_obs(jnp.asarray(np.stack(obs)))
     assert got.shape == (13, 9)
     np.testing.assert_allclose(got, np.stack(qpos), atol=1e-5)
-
-
-# -- tasks ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("lead", [(), (7,), (5, 4), (2, 3, 4)])
-@pytest.mark.parametrize("name", hc.TASK_NAMES)
-def test_task_reward_equals_the_reference_at_every_leading_shape(name, lead):
-    rng = np.random.default_rng(0)
-    obs, next_obs = rng.normal(size=(2, *lead, 18)).astype(np.float32)
-    action = rng.uniform(-1, 1, (*lead, 6)).astype(np.float32)
-    got = hc.task_reward(hc.task(name), obs, jnp.asarray(action), jnp.asarray(next_obs))
-    assert got.shape == lead and got.dtype == jnp.float32
-    want = reference.task_reward(name.replace("-", "_"), action, next_obs)
-    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
-
-
-def test_one_action_serves_a_particle_set():
-    next_obs = jnp.ones((5, 4, 18))
-    got = hc.task_reward(hc.task("forward"), next_obs, jnp.ones(6), next_obs)
-    np.testing.assert_allclose(got, np.full((5, 4), 0.4), rtol=1e-6)
-
-
-def test_tasks_are_a_vmap_axis():
-    next_obs = jnp.zeros(18).at[hc.FORWARD_VELOCITY].set(2.0)
-    next_obs = next_obs.at[hc.PITCH_RATE].set(3.0)
-    reward = jax.vmap(hc.task_reward, (0, None, None, None))
-    got = reward(hc.tasks(), next_obs, jnp.zeros(6), next_obs)
-    np.testing.assert_allclose(got, [2.0, -2.0, 3.0, -3.0])
-    for i, name in enumerate(hc.TASK_NAMES):
-        one = jax.tree.map(lambda x, i=i: x[i], hc.tasks())
-        assert jax.tree.map(float, hc.task(name)) == jax.tree.map(float, one)
-
-
-def test_unknown_tasks_and_observations_fail():
-    with pytest.raises(ValueError, match="task must be one of forward, .*'backflip'"):
-        hc.task("backflip")
-    obs = jnp.zeros((3, 17))
-    with pytest.raises(
-        ValueError, match=r"next_obs must be float32\[\.\.\., 18\], got"
-    ):
-        hc.task_reward(hc.task("forward"), obs, jnp.zeros(6), obs)
-
-
-# -- model space ---------------------------------------------------------------------
-
-
-def test_model_space_equals_the_reference():
-    space = hc.model_space()
-    rng = np.random.default_rng(0)
-    obs, next_obs = (3 * rng.normal(size=(2, 6, 18))).astype(np.float32)
-    features = space.features(jnp.asarray(obs))
-    assert features.shape == (6, 18)
-    want = reference.cheetah_inputs(np.float64(obs), np.zeros((6, 0)))
-    np.testing.assert_allclose(features, want, atol=1e-6)
-    target = space.target(jnp.asarray(obs), jnp.asarray(next_obs))
-    want = reference.cheetah_targets(np.float64(obs), np.float64(next_obs))
-    np.testing.assert_allclose(target, want, atol=1e-5)
-    back = space.next_obs(jnp.asarray(obs), target)
-    np.testing.assert_allclose(back, next_obs, atol=2e-6)  # o + (x - o), rounded
-
-
-def test_features_leave_out_what_the_model_need_not_know():
-    features = hc.model_space().features
-    obs = jnp.linspace(-1, 1, 18)
-    moved = obs.at[hc.FORWARD_VELOCITY].add(5.0)
-    np.testing.assert_array_equal(features(moved), features(obs))
-    turned = obs.at[hc.PITCH].add(2 * math.pi)
-    np.testing.assert_allclose(features(turned), features(obs), atol=1e-6)
-
-
-def test_bound_leaves_the_pitch_free():
-    bound = hc.model_space().bound
-    low, high = -jnp.ones(18), 2 * jnp.ones(18)
-    for value, edge in ((50.0, 2.0), (-50.0, -1.0)):
-        got = bound(jnp.full((3, 18), value), low, high)
-        want = np.full((3, 18), edge)
-        want[:, hc.PITCH] = value
-        np.testing.assert_array_equal(got, want)
-    inside = jnp.linspace(-1, 2, 18)
-    np.testing.assert_array_equal(bound(inside, low, high), inside)
-
-
-def test_imagined_flips_keep_turning(key):
-    """The ensemble bounds every state but the pitch, whatever its data showed."""
-    config = jaxpets.EnsembleConfig(
-        num_members=2, hidden_sizes=(), weight_decays=(0.0,), state_margin=0.5
-    )
-    model = jaxpets.ensemble(config, hc.model_space(), obs_size=18, action_size=6)
-    params = jax.jit(model.init)(key)
-    kernel = jnp.zeros((2, 24, 36))
-    push = jnp.zeros((2, 36)).at[:, :18].set(1.0).at[:, 18:].set(-20.0)
-    members = {"params": {"layer_0": {"kernel": kernel, "bias": push}}}
-    scaler = params.scaler._replace(low=-jnp.ones(18), high=jnp.ones(18))
-    params = params._replace(
-        network=params.network._replace(members=members), scaler=scaler
-    )
-    rollout = jaxpets.particle_rollout(model.sample, num_members=2, num_particles=2)
-    path = rollout(params, key, jnp.zeros(18), jnp.zeros((1, 30, 6)))
-    last = np.asarray(path[0, -1].reshape(2, 18))
-    np.testing.assert_allclose(last[:, hc.PITCH], 30.0, rtol=0.05)
-    rest = np.delete(last, hc.PITCH, axis=1)
-    assert np.abs(rest).max() <= 2.0 + 1e-6

@@ -5,8 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jaxpets
 import pytest
+
+import jaxpets
 
 PACKAGE = Path(jaxpets.__file__).parent
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -135,8 +136,10 @@ def test_sizes_stay_small(name):
 
 
 OUTSIDE = [
-    path for part in ("experiments", "benchmarks") for path in (REPOSITORY / part).rglob("*.py")
-]  # fmt: skip
+    path
+    for part in ("experiments", "benchmarks")
+    for path in sorted((REPOSITORY / part).rglob("*.py"))
+]
 
 
 @pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: path.stem)
@@ -183,7 +186,6 @@ def test_import_is_light_and_silent():
         text=True,
         timeout=120,
         check=False,
-        env=None,
         cwd=PACKAGE.parent,
     )
     assert result.returncode == 0, result.stderr

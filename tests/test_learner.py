@@ -1,10 +1,11 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import optax
 import pytest
 import toys
+
+import jaxpets
 from jaxpets import FitConfig, RewardData
 
 ENV = toys.cart_env()
@@ -108,15 +109,24 @@ def test_one_trace_and_stable_avals_while_data_grow(key):
 
 
 def test_vmapped_seeds_equal_single_runs():
+    """As the experiments map it: the seeds share the size of their datasets."""
+    axes = jaxpets.LearnerState(0, 0, jaxpets.DATASET_AXES, 0)
     keys = jax.random.split(jax.random.key(3), 2)
-    states = jax.jit(jax.vmap(LEARNER.init))(keys)
-    step = jax.jit(jax.vmap(lambda key, state: LEARNER.step(CHANCE, key, state)))
-    got = step(keys, states)
+    states = jax.jit(jax.vmap(LEARNER.init, out_axes=axes))(keys)
+    step = jax.vmap(
+        lambda key, state: LEARNER.step(CHANCE, key, state), (0, axes), (axes, 0)
+    )
+    states, output = jax.jit(step)(keys, states)
+    assert states.dataset.size.shape == () and states.dataset.size == LENGTH
+    assert states.dataset.data.obs.shape == (2, 3 * LENGTH, 2)
     for i in range(2):
-        want = STEPS[0](keys[i], INIT(keys[i]))
-        one = jax.tree.map(lambda x, i=i: x[i], got)
+        want, want_output = STEPS[0](keys[i], INIT(keys[i]))
+        params, got_output = jax.tree.map(lambda x, i=i: x[i], (states.params, output))
         # Batched products round otherwise; thirty updates with Adam.
-        toys.assert_trees_close(one, want, rtol=5e-3, atol=5e-4)
+        toys.assert_trees_close(params, want.params, rtol=5e-3, atol=5e-4)
+        toys.assert_trees_close(got_output, want_output, rtol=5e-3, atol=5e-4)
+        rows = jax.tree.map(lambda x, i=i: x[i], states.dataset.data)
+        toys.assert_trees_close(rows, want.dataset.data, rtol=1e-5, atol=1e-6)
 
 
 def test_learning_alone_equals_its_half_of_a_trial(key):

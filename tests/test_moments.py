@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import reference
+
 from jaxpets._src.moments import moments
 
 

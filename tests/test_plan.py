@@ -1,10 +1,11 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import reference
 import toys
+
+import jaxpets
 from jaxpets import PlanParams
 
 ROLLOUT = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=6)
@@ -227,6 +228,24 @@ def test_wrong_rollout_shape_fails_when_traced(shape, key):
     )
     with pytest.raises(ValueError, match=r"rollout_fn must return shape \(64, 6, E, P"):
         jax.eval_shape(planner.step, PARAMS, key, planner.init(), jnp.zeros(2))
+
+
+@pytest.mark.parametrize("name", toys.OPTIMIZERS)
+@pytest.mark.parametrize("horizon", [1, 6])
+def test_a_warm_start_of_another_horizon_fails_when_traced(name, horizon, key):
+    planner = jaxpets.plan(CART, toys.reach, toys.optimizer(name))
+    state = toys.optimizer(name, horizon=horizon).init()
+    text = rf"state.mean must be float32\[5, 1\], got float32\[{horizon}, 1\]"
+    with pytest.raises(ValueError, match=text):
+        jax.eval_shape(planner.step, PARAMS, key, state, jnp.zeros(2))
+
+
+@pytest.mark.parametrize("name", toys.OPTIMIZERS)
+def test_a_wrong_objective_fails_when_traced(name, key):
+    search = toys.optimizer(name)
+    for values in (jnp.zeros((200, 1)), jnp.zeros(3), jnp.zeros(())):
+        with pytest.raises(ValueError, match=r"objective_fn's result must be float32"):
+            search.step(lambda *_, v=values: v, key, search.init())
 
 
 def test_wrong_keys_fail_when_traced():

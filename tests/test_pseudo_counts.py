@@ -1,10 +1,11 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import reference
 import toys
+
+import jaxpets
 from jaxpets.rewards import pseudo_count, simhash
 
 # Jitted once; the tests keep to a few sizes, for sorts are slow to compile.
@@ -124,8 +125,7 @@ def test_old_states_are_hashed_anew():
 def test_counts_follow_a_ring_that_went_round():
     states = clustered(size=300)
     dataset = jaxpets.init_dataset(200, D, 1)
-    for part in (states[:150], states[150:]):
-        part = jnp.asarray(part)
+    for part in jnp.asarray(states).reshape(2, 150, D):
         rows = jaxpets.Transition(part, jnp.zeros((150, 1)), part)
         dataset = jaxpets.append(dataset, rows)
     projection = np.asarray(simhash(jax.random.key(2), 32, D))

@@ -1,10 +1,11 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import reference
 import toys
+
+import jaxpets
 from jaxpets.rewards import epistemic, one_step_disagreement
 
 E, P, D = 5, 4, 6

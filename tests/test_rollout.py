@@ -1,10 +1,11 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import reference
 import toys
+
+import jaxpets
 
 E, P, N, H = 3, 4, 5, 6
 

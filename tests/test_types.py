@@ -1,7 +1,8 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
+
+import jaxpets
 
 
 def test_worst_value_stays_finite_in_sums_and_below_any_return():

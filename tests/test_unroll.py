@@ -1,9 +1,10 @@
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
 import pytest
 import toys
+
+import jaxpets
 from jaxpets import PlanParams
 
 ENV = toys.cart_env()

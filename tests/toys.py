@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxpets
 import numpy as np
+
+import jaxpets
 
 LIMIT = np.ones(1, np.float32)
 DT = 0.1
@@ -144,6 +145,12 @@ def transitions(length, obs_size=2, action_size=1, seed=0):
     next_obs = drift + 0.05 * rng.normal(size=obs.shape)
     rows = (obs, action, next_obs)
     return jaxpets.Transition(*(jnp.asarray(x, jnp.float32) for x in rows))
+
+
+def dataset_of(data, capacity=40):
+    """A dataset that holds `data`."""
+    obs_size, action_size = data.obs.shape[1], data.action.shape[1]
+    return jaxpets.append(jaxpets.init_dataset(capacity, obs_size, action_size), data)
 
 
 def assert_trees_close(got, want, **tolerance):

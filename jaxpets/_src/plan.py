@@ -48,6 +48,8 @@ def plan(
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         reward = jnp.asarray(reward_fn(params, obs, action, next_obs))
         particles = obs.shape[:-1]
+        if reward.dtype != jnp.float32:
+            raise TypeError(f"reward_fn must return float32, got {reward.dtype}.")
         if reward.shape not in ((), particles):
             raise ValueError(
                 f"reward_fn must return shape () or {particles}, got {reward.shape}."

@@ -1,0 +1,144 @@
+"""The members of every protocol, each with three sets of arguments."""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import toys
+
+import jaxpets
+from jaxpets import PlanParams
+from jaxpets.envs import env_rollout
+from jaxpets.envs import half_cheetah as hc
+
+MODEL = toys.small_ensemble()
+MODELS = jax.jit(jax.vmap(MODEL.init))(jax.random.split(jax.random.key(0), 3))
+ENV = toys.cart_env()
+NOISY = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=4)
+LEARNED = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
+
+
+class Case(NamedTuple):
+    """One function and three sets of arguments with equal avals."""
+
+    fn: Callable
+    variant: Callable[[int], tuple]
+    # Positions of the state among the arguments and the results, if there is one.
+    state: tuple[int, int] | None = None
+
+
+def key_of(i):
+    """A fresh key: the checker of keys takes slices of one array for its reuse."""
+    return jax.random.key(100 + i)
+
+
+def keys_of(*shape):
+    return jax.random.split(jax.random.key(1), shape)
+
+
+def model(i):
+    return jax.tree.map(lambda x: x[i], MODELS)
+
+
+def cart_obs(i):
+    return jnp.array([0.1 * i - 0.1, 0.2 - 0.3 * i])
+
+
+def warm(init, i):
+    """A state as an earlier call may have left it."""
+    return jax.tree.map(lambda x: x + jnp.float32(0.1 * i), init())
+
+
+def planner_case(name):
+    if name == "random":
+        planner = jaxpets.random_planner(ENV.action_low, ENV.action_high)
+    else:
+        planner = jaxpets.plan(NOISY, toys.reach, toys.optimizer(name, horizon=3))
+
+    def variant(i):
+        params = PlanParams(jnp.float32(1 + 0.2 * i), jnp.float32(0.5 * i))
+        return params, key_of(i), warm(planner.init, i), cart_obs(i)
+
+    return Case(planner.step, variant, (2, 1))
+
+
+def optimizer_case(name):
+    search = toys.optimizer(name, horizon=3, size=2)
+
+    def step(optimum, key, state):
+        def objective(key, actions):
+            jitter = 1e-3 * jax.random.normal(key, actions.shape[:1], jnp.float32)
+            return jitter - jnp.sum((actions - optimum) ** 2, (1, 2))
+
+        return search.step(objective, key, state)
+
+    def variant(i):
+        return jnp.float32(0.3 * i), key_of(i), warm(search.init, i)
+
+    return Case(step, variant, (2, 1))
+
+
+def actions(i):
+    return jnp.sin(jnp.arange(20.0) + i).reshape(5, 4, 1)
+
+
+def particles(i, size=2):
+    count = 3 * 4 * size
+    return jnp.cos(jnp.arange(float(count)) * (i + 1)).reshape(3, 4, size)
+
+
+def step_of(i, size=2, action_size=1):
+    action = jnp.full((action_size,), 0.1 * i, jnp.float32)
+    return particles(i, size), action, particles(i + 3, size)
+
+
+def counts(i):
+    projection = jaxpets.rewards.simhash(jax.random.key(5), 8, 2)
+    rows = particles(i).reshape(12, 2)
+    data = jaxpets.Transition(rows, rows[:, :1], rows)
+    dataset = jaxpets.append(jaxpets.init_dataset(16, 2, 1), data)
+    return jaxpets.rewards.count_states(projection, dataset)
+
+
+def mixture(params, obs, action, next_obs):
+    step = (obs, action, next_obs)
+    novelty = jaxpets.rewards.epistemic(params[1], *step)
+    return toys.reach(params[0], *step) + 0.1 * novelty
+
+
+CASES = {
+    **{f"plan-{n}": functools.partial(planner_case, n) for n in toys.OPTIMIZERS},
+    "random_planner": lambda: planner_case("random"),
+    **{n: functools.partial(optimizer_case, n) for n in toys.OPTIMIZERS},
+    "particle_rollout": lambda: Case(
+        NOISY, lambda i: (jnp.float32(1 + i), key_of(i), cart_obs(i), actions(i))
+    ),
+    "particle_rollout-ensemble": lambda: Case(
+        LEARNED, lambda i: (model(i), key_of(i), cart_obs(i), actions(i))
+    ),
+    "env_rollout": lambda: Case(
+        env_rollout(ENV), lambda i: ((), key_of(i), ENV.reset(key_of(i)), actions(i))
+    ),
+    "epistemic": lambda: Case(
+        jaxpets.rewards.epistemic, lambda i: (jnp.full(2, i + 0.5), *step_of(i))
+    ),
+    "pseudo_count": lambda: Case(
+        jaxpets.rewards.pseudo_count, lambda i: (counts(i), *step_of(i))
+    ),
+    "one_step_disagreement": lambda: Case(
+        jaxpets.rewards.one_step_disagreement(MODEL.predict),
+        lambda i: (model(i), *step_of(i)),
+    ),
+    "task_reward": lambda: Case(
+        hc.task_reward,
+        lambda i: (jax.tree.map(lambda x: x[i], hc.tasks()), *step_of(i, 18, 6)),
+    ),
+    "user-reward": lambda: Case(toys.reach, lambda i: (jnp.float32(i), *step_of(i))),
+    "mixture": lambda: Case(
+        mixture, lambda i: ((jnp.float32(i), jnp.ones(2)), *step_of(i))
+    ),
+}
+STATEFUL = [name for name in CASES if "plan" in name or name in toys.OPTIMIZERS]
+KEYED = [*STATEFUL, "particle_rollout", "particle_rollout-ensemble"]

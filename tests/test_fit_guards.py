@@ -1,0 +1,124 @@
+"""What training refuses, skips and keeps in order."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import toys
+from toys import dataset_of
+
+import jaxpets
+from jaxpets import FitConfig
+
+CAPACITY = 40
+
+
+@pytest.fixture(scope="module")
+def model():
+    return toys.small_ensemble()
+
+
+@pytest.fixture(scope="module")
+def params(model):
+    return jax.jit(model.init)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def fitter(model):
+    return jaxpets.fit(model, optax.adam(1e-3), FitConfig(num_epochs=3, batch_size=8))
+
+
+@pytest.fixture(scope="module")
+def step(fitter):
+    return jax.jit(fitter.step)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_update_whose_loss_is_not_finite_is_dropped(
+    model, params, step, fitter, bad
+):
+    data = toys.transitions(40)
+    data = data._replace(next_obs=data.next_obs.at[11].set(bad))
+    after, state, metrics = step(
+        params, jax.random.key(0), fitter.init(params), dataset_of(data)
+    )
+    for leaf in jax.tree.leaves((after.network, state)):
+        assert jnp.all(jnp.isfinite(leaf))
+    assert 0 < metrics.num_skipped < metrics.num_updates
+    # Dropped updates leave the optimizer alone, too.
+    assert int(state.opt_state[0].count) == metrics.num_updates - metrics.num_skipped
+    assert jnp.isfinite(metrics.loss)
+
+
+def test_the_model_stays_usable_after_a_bad_row(model, params, step, fitter):
+    data = toys.transitions(40)
+    data = data._replace(next_obs=data.next_obs.at[11].set(jnp.nan))
+    after, _, _ = step(params, jax.random.key(0), fitter.init(params), dataset_of(data))
+    drawn = jax.jit(model.sample)(
+        after, jax.random.key(1), jnp.zeros((3, 4, 2)), jnp.zeros((4, 1))
+    )
+    assert jnp.all(jnp.isfinite(drawn))
+
+
+def test_an_update_whose_gradient_is_not_finite_is_dropped(model, params):
+    """A loss may be finite where its gradient is not."""
+
+    def loss(network, inputs, targets, weight):
+        total, mse = model.loss(network, inputs, targets, weight)
+        zero = jnp.sum(weight) - jnp.sum(weight)
+        # The root has the value 0 and an infinite slope.
+        return total + jnp.sqrt(zero * jnp.sum(network.max_logvar)), mse
+
+    fitter = jaxpets.fit(model._replace(loss=loss), optax.adam(1e-3), FitConfig())
+    dataset = dataset_of(toys.transitions(40))
+    after, _, metrics = jax.jit(fitter.step)(
+        params, jax.random.key(0), fitter.init(params), dataset
+    )
+    for leaf in jax.tree.leaves(after.network):
+        assert jnp.all(jnp.isfinite(leaf))
+    assert metrics.num_skipped == metrics.num_updates
+
+
+def test_max_logvar_never_crosses_min_logvar():
+    """A strong pull on the bounds and a high rate: they meet and stop."""
+    model = toys.small_ensemble(bound_decay=300.0)
+    params = jax.jit(model.init)(jax.random.key(0))
+    config = FitConfig(num_epochs=20, batch_size=8)
+    fitter = jaxpets.fit(model, optax.adam(0.3), config)
+    step = jax.jit(fitter.step)
+    state, dataset = fitter.init(params), dataset_of(toys.transitions(40))
+    met = False
+    for call in range(5):
+        params, state, _ = step(params, jax.random.key(call), state, dataset)
+        gap = params.network.max_logvar - params.network.min_logvar
+        assert jnp.all(gap > 0)
+        met |= bool(jnp.any(gap < 0.2))
+        assert jnp.all(jaxpets.max_variance(params) > 1e-12)
+    assert met  # the case is the one meant
+
+
+def test_bad_settings_fail_when_built():
+    with pytest.raises(ValueError, match="num_epochs must be at least 1, got 0"):
+        FitConfig(num_epochs=0)
+    with pytest.raises(TypeError, match="batch_size must be a Python int"):
+        FitConfig(batch_size=32.0)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        FitConfig().batch_size = 1
+
+
+def test_a_raw_key_fails_when_traced(fitter, params):
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    with pytest.raises(TypeError, match="key must be a typed key"):
+        fitter.step(params, jax.random.PRNGKey(0), fitter.init(params), dataset)
+
+
+@pytest.mark.parametrize("sizes", [(3, 1), (2, 2)])
+def test_a_dataset_of_other_sizes_fails_when_traced(fitter, params, sizes):
+    dataset = jaxpets.init_dataset(CAPACITY, *sizes)
+    with pytest.raises(ValueError, match=r"data\S* must be float32\[.*got float32"):
+        jax.eval_shape(
+            fitter.step, params, jax.random.key(0), fitter.init(params), dataset
+        )
