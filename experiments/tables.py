@@ -148,7 +148,7 @@ def seconds(by_run: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     for run, trials in by_run.items():
         parts = [
             _median([trial["seconds"].get(part) for trial in trials])
-            for part in ("act", "fit", "save")
+            for part in ("act", "fit")
         ]
         total = [
             sum(x for x in trial["seconds"].values() if x is not None)
@@ -156,7 +156,7 @@ def seconds(by_run: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
         ]
         seeds = str(max(len(trial["seeds"]) for trial in trials))
         rows.append([run, seeds, str(len(trials)), *parts, _median(total)])
-    header = ["run", "seeds at once", "trials", "act", "fit", "save", "together"]
+    header = ["run", "seeds at once", "trials", "act", "fit", "together"]
     return table(header, rows)
 
 

@@ -1,0 +1,29 @@
+# Two commands do all the set-up: `make explore` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+OUT ?= runs
+
+.PHONY: explore test lint clean
+
+$(VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	touch $@
+
+# The main job: explore without a reward, perform four tasks, report.
+explore: $(VENV)/.installed
+	$(BIN)/python -m experiments.run --phase explore --out $(OUT)
+	$(BIN)/python -m experiments.run --phase zero-shot --out $(OUT) --video $(OUT)/cheetah.mp4
+	$(BIN)/python -m experiments.run --phase report --out $(OUT)
+
+test: $(VENV)/.installed
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+clean:
+	rm -rf $(VENV)
