@@ -133,11 +133,12 @@ class Config:
 
 _LAPTOP_PLANNER = PlannerNumbers(
     optimizer="icem",
-    horizon=20,
+    horizon=15,
     num_samples=64,
     num_elites=8,
     num_iterations=3,
     num_particles=5,
+    noise_beta=1.0,
     precision="f32",
 )
 _SMOKE_PLANNER = PlannerNumbers(
@@ -164,9 +165,9 @@ PRESETS = {
         chunk_length=10,
         milestones=(),
         model=ModelNumbers(hidden_size=128, num_layers=3),
-        training=TrainingNumbers(num_epochs=20, batch_size=64),
+        training=TrainingNumbers(num_epochs=20, batch_size=64, learning_rate=2e-3),
         planner=_LAPTOP_PLANNER,
-        task_planner=dataclasses.replace(_LAPTOP_PLANNER, horizon=15),
+        task_planner=dataclasses.replace(_LAPTOP_PLANNER, noise_beta=0.5),
     ),
     "smoke": Config(
         tyro.MISSING,

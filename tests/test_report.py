@@ -142,7 +142,7 @@ def test_report_shows_means_spread_and_every_seed(out):
     # Trials 4 and 5 of two seeds.
     assert "| 4 | 1000 ± 0.7 (2 seeds) |" in text
     assert "| 5 | 2000 ± 0.7 (2 seeds) |" in text
-    assert "| laptop-epistemic | 3 | 3 | 4.00 | 1.00 | not logged | 5.00 |" in text
+    assert "| laptop-epistemic | 3 | 3 | 4.00 | 1.00 | 5.00 |" in text
     assert "jax 9.9, device_kind abacus" in text
     # Trial 1 of 6 seeds, -(1 + seed).
     assert "mean of 6 trials: forward -2.0" in text

@@ -6,7 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_action_box, check_count, check_real
+from jaxpets._src.checks import (
+    check_action_box,
+    check_array,
+    check_count,
+    check_real,
+)
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
@@ -88,16 +93,23 @@ def cem(
     def step(
         objective_fn: ObjectiveFn, key: Array, state: CEMState
     ) -> tuple[Solution, CEMState]:
+        check_array("state.mean", state.mean, shape)
+
         def iterate(carry: tuple, key: Array) -> tuple[tuple, None]:
             mean, variance, _value = carry
             sample_key, value_key = jax.random.split(key)
             actions = sample(sample_key, mean, variance)
             values = objective_fn(value_key, actions)
+            check_array("objective_fn's result", values, [num_samples])
             elite_values, elite_index = jax.lax.top_k(values, num_elites)
             elites = actions[elite_index]
             kept = 0.0 if legacy_variance else momentum
             new = (
-                momentum * mean + (1 - momentum) * elites.mean(0),
+                jnp.clip(
+                    momentum * mean + (1 - momentum) * elites.mean(0),
+                    action_low,
+                    action_high,
+                ),
                 kept * variance + (1 - kept) * elites.var(0),
                 elite_values.mean(),
             )

@@ -23,6 +23,14 @@ def check_count(name: str, value: Any, minimum: int = 1) -> None:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
 
 
+def check_counts(name: str, values: Any) -> None:
+    """Raises unless `values` is a tuple or list of positive Python integers."""
+    if not isinstance(values, (tuple, list)):
+        raise TypeError(f"{name} must be a tuple of ints, got {values!r}.")
+    for value in values:
+        check_count(name, value)
+
+
 def check_real(name: str, value: Any, low: float, high: float = math.inf) -> None:
     """Raises unless `value` is a finite Python number in `[low, high]`."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)):
@@ -38,6 +46,10 @@ def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> Non
     Entries of `shape` that are None or a letter match any size; a leading "..."
     matches any number of axes.
     """
+    text = ", ".join("?" if want is None else str(want) for want in shape)
+    if not isinstance(value, (Array, np.ndarray, np.generic, int, float)):
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be float32[{text}], got {value!r} ({kind}).")
     got = jnp.shape(value)
     wanted = tuple(shape)
     tail = wanted
@@ -52,7 +64,6 @@ def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> Non
     )  # fmt: skip
     dtype = jnp.result_type(value)
     if not fits or dtype != jnp.float32:
-        text = ", ".join("?" if want is None else str(want) for want in wanted)
         raise ValueError(f"{name} must be float32[{text}], got {dtype}{list(got)}.")
 
 
@@ -60,6 +71,8 @@ def check_action_box(action_low: Array, action_high: Array) -> None:
     """Raises unless the two are `[A]`, finite and `low < high` in every entry."""
     check_array("action_low", action_low, ["A"])
     check_array("action_high", action_high, [jnp.shape(action_low)[0]])
+    if jnp.shape(action_low)[0] == 0:
+        raise ValueError("action_low must have at least one entry, got float32[0].")
     bounds = (action_low, action_high)
     if any(isinstance(bound, Tracer) for bound in bounds):
         return

@@ -47,6 +47,7 @@ def append(dataset: Dataset, transitions: Transition) -> Dataset:
       ValueError: if a width, a length or a dtype does not fit.
     """
     capacity, obs_size = dataset.data.obs.shape
+    check_array("transitions.obs", transitions.obs, ["T", obs_size])
     length = transitions.obs.shape[0]
     if length > capacity:
         raise ValueError(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count, check_real
+from jaxpets._src.checks import check_array, check_count, check_counts, check_real
 from jaxpets._src.moments import moments
 from jaxpets._src.types import DynamicsFn, ModelSpace, Transition
 
@@ -50,8 +50,7 @@ class EnsembleConfig:
 
     def __post_init__(self) -> None:
         check_count("num_members", self.num_members)
-        for size in self.hidden_sizes:
-            check_count("hidden_sizes", size)
+        check_counts("hidden_sizes", self.hidden_sizes)
         if len(self.weight_decays) != len(self.hidden_sizes) + 1:
             raise ValueError(
                 "weight_decays must have one entry per layer "
@@ -216,15 +215,17 @@ def ensemble(
         if config.state_margin is None:
             return next_obs
         low, high = params.scaler.low, params.scaler.high
-        # Before any data the range is infinite, and so must its margin be.
-        margin = config.state_margin * (high - low)
+        # Before any data the range is infinite; 0 times that would be NaN.
+        margin = config.state_margin * (high - low) if config.state_margin else 0.0
         return space.bound(next_obs, low - margin, high + margin)
 
     def fit_scaler(data: Transition, size: Array) -> Scaler:
+        check_array("data.obs", data.obs, ["C", obs_size])
+        check_array("data.action", data.action, ["C", action_size])
         inputs = jnp.concatenate([space.features(data.obs), data.action], axis=-1)
         mean, std = moments(inputs, size)
-        used = (jnp.arange(inputs.shape[0]) < size)[:, None]
         obs = jnp.stack([data.obs, data.next_obs])
+        used = (jnp.arange(inputs.shape[0]) < size)[:, None] & jnp.isfinite(obs)
         low = jnp.min(jnp.where(used, obs, jnp.inf), axis=(0, 1))
         high = jnp.max(jnp.where(used, obs, -jnp.inf), axis=(0, 1))
         # Without data there is no range to keep to.

@@ -6,7 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_action_box, check_count, check_real
+from jaxpets._src.checks import (
+    check_action_box,
+    check_array,
+    check_count,
+    check_real,
+)
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
@@ -89,6 +94,8 @@ def icem(
         objective_fn: ObjectiveFn, key: Array, state: ICEMState
     ) -> tuple[Solution, ICEMState]:
         mean, kept = state
+        check_array("state.mean", mean, shape)
+        check_array("state.elites", kept, [num_kept, *shape])
         std = jnp.broadcast_to(init_std * half_width, shape)
         keys = jax.random.split(key, num_iterations)
         best = value = None
@@ -102,9 +109,11 @@ def icem(
                 candidates.append(mean[None])
             actions = jnp.concatenate(candidates)
             values = objective_fn(value_key, actions)
+            check_array("objective_fn's result", values, [actions.shape[0]])
             elite_values, elite_index = jax.lax.top_k(values, num_elites)
             elites = actions[elite_index]
             mean = momentum * mean + (1 - momentum) * elites.mean(0)
+            mean = jnp.clip(mean, action_low, action_high)
             std = momentum * std + (1 - momentum) * elites.std(0)
             kept, best, value = elites[:num_kept], elites[0], elite_values.mean()
         assert best is not None and value is not None
@@ -133,7 +142,8 @@ def colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
         return jax.random.normal(key, shape, jnp.float32)
     frequency = jnp.fft.rfftfreq(horizon).astype(jnp.float32)
     # The mean has the power of the lowest frequency, as it would of one still lower.
-    frequency = jnp.maximum(frequency, 1.0 / horizon)
+    # In units of the lowest, so that no power of it overflows.
+    frequency = jnp.maximum(frequency * horizon, 1.0)
     scale = frequency ** (-beta / 2)
     real_key, imaginary_key = jax.random.split(key)
     half = (*shape[:-2], shape[-1], frequency.shape[0])

@@ -6,8 +6,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_action_box, check_count, check_real
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.checks import (
+    check_action_box,
+    check_array,
+    check_count,
+    check_real,
+)
+from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
 
 
 class MPPIState(NamedTuple):
@@ -64,18 +69,25 @@ def mppi(
     def step(
         objective_fn: ObjectiveFn, key: Array, state: MPPIState
     ) -> tuple[Solution, MPPIState]:
+        check_array("state.mean", state.mean, shape)
+
         def iterate(mean: Array, key: Array) -> tuple[Array, Array]:
             sample_key, value_key = jax.random.split(key)
             noise = jax.random.normal(sample_key, (num_samples, *shape), jnp.float32)
             actions = jnp.clip(mean + scale * noise, action_low, action_high)
             values = objective_fn(value_key, actions)
+            check_array("objective_fn's result", values, [num_samples])
             # Ranks, not values, set the scale where one candidate has blown up.
-            low, high = jnp.quantile(values, jnp.array([0.25, 0.75], jnp.float32))
+            # The rejected neither set the scale nor have a weight, unless all are.
+            kept = (values > WORST_VALUE) | jnp.all(values <= WORST_VALUE)
+            quartiles = jnp.array([0.25, 0.75], jnp.float32)
+            low, high = jnp.nanquantile(jnp.where(kept, values, jnp.nan), quartiles)
             spread = jnp.maximum(high - low, 1e-6)
             weights = jax.nn.softmax(
-                (values - jnp.max(values)) / (temperature * spread)
+                (values - jnp.max(values)) / (temperature * spread), where=kept
             )
-            return jnp.einsum("n,nha->ha", weights, actions), jnp.sum(weights * values)
+            mean = jnp.einsum("n,nha->ha", weights, actions)
+            return jnp.clip(mean, action_low, action_high), jnp.sum(weights * values)
 
         keys = jax.random.split(key, num_iterations)
         mean, values = jax.lax.scan(iterate, state.mean, keys)

@@ -1,5 +1,6 @@
 """An environment and a planner, stepped together in one scan."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -38,6 +39,7 @@ def unroll(
     state: UnrollState,
     *,
     length: int,
+    observe_fn: Callable[[EnvState], Any] = lambda state: state.obs,
 ) -> tuple[UnrollState, Transition, PlanOutput]:
     """Runs the planner in the environment for T = `length` steps.
 
@@ -51,6 +53,8 @@ def unroll(
       key: consumed by the whole trial.
       state: from `start`, or from the last part.
       length: T.
+      observe_fn: what the planner gets to see; `lambda state: state` for a planner
+        that imagines with the simulator, see `jaxpets.envs.env_rollout`.
 
     Returns:
       The state after T steps, the transitions `[T, ...]` and the plans `[T, ...]`.
@@ -64,7 +68,7 @@ def unroll(
     def tick(state: UnrollState, _: None) -> tuple[UnrollState, tuple]:
         plan_key = jax.random.fold_in(key, state.step)
         output, planner_state = planner.step(
-            params, plan_key, state.planner, state.env.obs
+            params, plan_key, state.planner, observe_fn(state.env)
         )
         env_state = env.step(state.env, output.action)
         transition = Transition(state.env.obs, output.action, env_state.obs)

@@ -47,13 +47,17 @@ def from_brax(env: BraxEnv) -> Env:
         if not hasattr(state.obs, "ndim") or state.obs.ndim != 1:
             shape = jax.tree.map(jnp.shape, state.obs)
             raise ValueError(f"env must observe one vector, got {shape}.")
+        # Brax mixes weak types into its state, which would trace every step twice.
+        state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
         return EnvState(state.obs.astype(jnp.float32), state)
 
     def reset(key: Array) -> EnvState:
-        return wrap(env.reset(jax.random.key_data(key)))
+        with jax.numpy_dtype_promotion("standard"):
+            return wrap(env.reset(jax.random.key_data(key)))
 
     def step(state: EnvState, action: Array) -> EnvState:
-        return wrap(env.step(state.physics, action))
+        with jax.numpy_dtype_promotion("standard"):
+            return wrap(env.step(state.physics, action))
 
     return Env(reset, step, action_low=-one, action_high=one)
 
