@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
+PYTEST_FLAGS ?=
 
 .PHONY: explore test lint clean
 
@@ -18,7 +19,7 @@ explore: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase report --out $(OUT)
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PYTEST_FLAGS)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
