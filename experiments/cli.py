@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from experiments import rundir
-from experiments.config import PRESETS, Config, validate
+from experiments.config import PRESETS, Config, ranges, validate
 from experiments.errors import CheckpointError, UsageError
 
 # Where a run that is continued may differ from its start.
@@ -30,12 +30,15 @@ def parse(argv: Sequence[str]) -> Config:
       SystemExit: after `--help`.
     """
     first = _first_flags(argv)
+    if first.name is not None:
+        _check_name(first.name)
     default = PRESETS[first.preset]
     if first.phase in ("zero-shot", "finetune"):
+        _tyro(argv, default)  # what is wrong with the flags comes before the run
         default = _explored(first, default)
     config = _tyro(argv, default)
-    if config.name is not None:
-        rundir.check_name(config.name)
+    if config.phase in ("zero-shot", "finetune"):
+        _check_same_run(config, default)
     validate(config)
     return config
 
@@ -120,6 +123,24 @@ def _first_flags(argv: Sequence[str]) -> argparse.Namespace:
     return first
 
 
+def _check_name(name: str) -> None:
+    try:
+        rundir.check_name(name)
+    except UsageError as error:
+        raise UsageError(f"--name: {error}") from None
+
+
+def _check_same_run(config: Config, explored: Config) -> None:
+    """Refuses labels other than those of the run that a later phase starts from."""
+    for name in ("preset", "arm"):
+        given, valid = getattr(config, name), getattr(explored, name)
+        if given != valid:
+            raise UsageError(
+                f"--{name} {given} is not valid; it must be {valid}, as in the "
+                "exploration run."
+            )
+
+
 def _joined(argv: Sequence[str]) -> list[str]:
     """Spells every flag with dashes, as tyro accepts underscores too."""
 
@@ -154,14 +175,20 @@ def _tyro(argv: Sequence[str], default: Config) -> Config:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        raise UsageError(_one_line(errors.getvalue())) from None
+        line = _one_line(errors.getvalue())
+        raise UsageError(f"{line.rstrip('.')}.{_range(line)}") from None
 
 
 def _one_line(text: str) -> str:
     """Shortens the boxed message of tyro to its words."""
-    text = text.partition("For full helptext")[0].replace(
-        "Argument helptext:", "; it is"
-    )
-    lines = [line.strip() for line in text.splitlines()]
-    lines = [line for line in lines if line and not re.fullmatch(r"[-─━=╭╮╰╯ ]+", line)]
-    return re.sub(r"\s+", " ", " ".join(lines[1:]) or text).strip()
+    text = text.partition("For full helptext")[0].partition("Argument helptext:")[0]
+    lines = [re.sub(r"[─━╭╮╰╯│]+", " ", line) for line in text.splitlines()]
+    # The first one is the title of the box.
+    return " ".join(" ".join(lines[1:]).split()) or "the flags cannot be read"
+
+
+def _range(line: str) -> str:
+    """Returns what is valid for the number whose flag a message names first."""
+    named = re.search(r"--[a-z][a-z.-]*[a-z]", line)
+    valid = ranges(PRESETS["smoke"]).get(named.group()) if named else None
+    return f" It must be {valid}." if valid else ""

@@ -160,7 +160,7 @@ PRESETS = {
         num_trials=48,
         trial_length=250,
         task_length=500,
-        eval_trials=1,
+        eval_trials=3,
         finetune_trials=3,
         chunk_length=10,
         milestones=(),
@@ -214,6 +214,10 @@ def validate(config: Config) -> None:
         divides = length % config.chunk_length == 0
         valid = f"a divisor of the length of a trial ({length})"
         _require(divides, "--chunk-length", config.chunk_length, valid)
+    if config.phase == "explore":
+        later = "left out in explore; it is for zero-shot and finetune"
+        _require(config.source is None, "--from", config.source, later)
+        _require(config.at_trial is None, "--at-trial", config.at_trial, later)
     if config.video is not None:
         good = config.video.suffix == ".mp4" and config.phase in (
             "zero-shot",
@@ -235,6 +239,19 @@ def _check_planner(flag: str, planner: PlannerNumbers, model: ModelNumbers) -> N
         planner.num_particles,
         f"a multiple of --model.num-members ({model.num_members})",
     )
+
+
+def ranges(config: Any, prefix: str = "--") -> dict[str, str]:
+    """Returns, per flag of a number, what is valid in words."""
+    found = {}
+    for field in dataclasses.fields(config):
+        flag = prefix + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value := getattr(config, field.name)):
+            found |= ranges(value, f"{flag}.")
+        elif "range" in field.metadata:
+            low, high = field.metadata["range"]
+            found[flag] = f"{low:,} to {high:,}"
+    return found
 
 
 def _check_ranges(config: Any, prefix: str) -> None:

@@ -76,12 +76,7 @@ def explore(config: Config, folder: Path, say: Say) -> None:
     keys = lambda trial: trial_keys(config, EXPLORE, trial)  # noqa: E731
     init = jax.jit(jax.vmap(parts.learner.init, out_axes=LEARNER_AXES))(keys(0))
     loop = Loop("explore", config.trial_length, keys, act, learn, labels)
-    trials = _run(config, folder, loop, init, 0, config.num_trials, say)
-    if trials is not None:
-        trials = jax.tree.map(lambda x: x[:, None, None], trials)
-        records.save_paths(
-            folder / "trajectories.npz", trials, config.seeds, ["forward"]
-        )
+    _run(config, folder, loop, init, 0, config.num_trials, say)
 
 
 def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -> None:
@@ -89,6 +84,10 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
 
     The jump-start of Table 1.
     """
+    log = folder / "metrics.jsonl"
+    if rundir.log_size(log):  # written once, at the end
+        say(f"already complete: {config.eval_trials} of {config.eval_trials} trials.")
+        return
     parts = build(config)
     state = _explored(config, source, step, parts, say)
     names, weights = _tasks(config)
@@ -114,8 +113,7 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
     ]
     rows = records.rows(labels, trials)
     records.save_paths(folder / "trajectories.npz", trials, config.seeds, names)
-    rundir.cut_log(folder / "metrics.jsonl", 0)
-    rundir.append_rows(folder / "metrics.jsonl", rows)
+    rundir.append_rows(log, rows)
     say(_summary(rows, names, f"{time.monotonic() - begin:.0f} s"))
 
 

@@ -56,10 +56,13 @@ def _dispatch(config: Config) -> None:
     folder = source / f"{config.phase}-{step:03d}"
     if config.task != "all":
         folder = folder.with_name(f"{folder.name}-{config.task}")
-    from experiments import phases
+    with (
+        _without_gl(),
+        session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say),
+    ):
+        from experiments import phases
 
-    phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
-    with session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say):
+        phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
         phase(config, source, folder, step, _say)
     if config.video is not None:
         _video(config, folder)
@@ -67,13 +70,14 @@ def _dispatch(config: Config) -> None:
 
 def _explore(config: Config, folder: Path) -> None:
     _check_cpu(config)
-    from experiments import phases
+    with (
+        _without_gl(),
+        session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say),
+    ):
+        from experiments import phases
 
-    with session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say):
         phases.explore(config, folder, _say)
-    flags = f"--from {config.source}" if config.source else ""
-    flags = flags or f"--preset {config.preset} --arm {config.arm}"
-    _say(f"next: python -m experiments.run --phase zero-shot {flags}")
+    _say(f"next: python -m experiments.run --phase zero-shot --from {folder}")
 
 
 def _explored_step(config: Config, source: Path) -> int:
@@ -101,13 +105,17 @@ def _video(config: Config, folder: Path) -> None:
         target = config.video
         if len(names) > 1:
             target = target.with_stem(f"{target.stem}-{name}")
-        video.render(
-            folder / "trajectories.npz",
-            target,
-            task=name,
-            seed=config.seeds[0],
-            trial=1,
-        )
+        try:
+            video.render(
+                folder / "trajectories.npz",
+                target,
+                task=name,
+                seed=config.seeds[0],
+                trial=1,
+            )
+        except RunError as error:
+            _say(f"warning: no video; the run is complete: {error}")
+            return
         _say(f"wrote {target}")
 
 
@@ -145,6 +153,22 @@ def _plain_errors(config: Config) -> Iterator[None]:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         raise OutOfMemoryError(_memory_advice(config)) from error
+
+
+@contextmanager
+def _without_gl() -> Iterator[None]:
+    """Lets mujoco be imported without OpenGL, which only a video's process needs.
+
+    A MUJOCO_GL that does not work here would end the run on that import.
+    """
+    chosen = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if chosen is not None:
+            os.environ["MUJOCO_GL"] = chosen
 
 
 def _memory_advice(config: Config) -> str:
