@@ -120,9 +120,9 @@ def test_plan_over_seeds_and_samples(tmp_path):
 
 
 def test_laptop_is_the_preset_of_the_experiments():
-    from experiments.config import preset
+    from experiments.config import PRESETS
 
-    planner = preset("laptop", "explore").planner
+    planner = PRESETS["laptop"].planner
     size = workloads.named_size("laptop")
     for name in ("num_samples", "num_elites", "num_iterations", "horizon"):
         assert getattr(size, name) == getattr(planner, name)

@@ -184,3 +184,19 @@ def test_a_model_of_another_size_fails(key):
 
     with pytest.raises(ValueError, match=r"must be float32\[.*\], got float32\["):
         jax.eval_shape(build_and_learn)
+
+
+def test_reward_data_that_change_shape_fail_when_traced(key):
+    """They would retrace every trial, and fail to be restored."""
+    growing = RewardData(
+        init=lambda key: jnp.zeros(2),
+        refresh=lambda data, params, dataset: jnp.concatenate([data, data]),
+    )
+    learner = build(growing)
+    state = jax.eval_shape(learner.init, key)
+    with pytest.raises(AssertionError, match="shape"):
+        jax.eval_shape(
+            lambda: learner.step(
+                CHANCE, key, INIT(key)._replace(reward=jnp.zeros(state.reward.shape))
+            )
+        )

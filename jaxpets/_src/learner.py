@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
 import jax
 from jax import Array
 
@@ -83,6 +84,7 @@ def learner(
 
     Raises:
       TypeError, ValueError: if a trial does not fit the capacity.
+      AssertionError: from `learn`, when traced, if `refresh` changes a shape or dtype.
     """
     check_count("trial_length", trial_length)
     check_count("capacity", capacity, minimum=trial_length)
@@ -102,6 +104,8 @@ def learner(
         dataset = append(state.dataset, transitions)
         params, fit, metrics = fitter.step(state.params, key, state.fit, dataset)
         reward = reward_data.refresh(state.reward, params, dataset)
+        # Another shape would retrace every trial.
+        chex.assert_trees_all_equal_shapes_and_dtypes(reward, state.reward)
         return LearnerState(params, fit, dataset, reward), metrics
 
     def step(
