@@ -79,19 +79,22 @@ def run(
       num_chunks: calls that make a trial.
       tick: called after every chunk with the steps of one actor.
     """
-    split = functools.partial(jax.random.split, num=2)
-    for _ in keys.shape:
-        split = jax.vmap(split)
-    pairs = split(keys)
-    state = actors.start(pairs[..., 0])
+    reset_keys, act_keys = split_keys(keys)
+    state = actors.start(reset_keys)
     chunks = []
     for _ in range(num_chunks):
-        state, transitions, values = actors.chunk(params, pairs[..., 1], state)
+        state, transitions, values = actors.chunk(params, act_keys, state)
         jax.block_until_ready(values)
         chunks.append(Trials(transitions, values))
         tick(values.shape[-1])
     time = keys.ndim
     return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=time), *chunks)
+
+
+def split_keys(keys: Array) -> tuple[Array, Array]:
+    """Splits every key of `[...]` in two, and returns the firsts and the seconds."""
+    pairs = jax.vmap(jax.random.split)(keys.reshape(-1)).reshape(*keys.shape, 2)
+    return pairs[..., 0], pairs[..., 1]
 
 
 @jax.jit

@@ -179,7 +179,7 @@ def _run(
     with progress.interruptible():
         for trial in range(done + 1, last + 1):
             begin = time.monotonic()
-            act_keys, fit_keys = _split(loop.keys(trial))
+            act_keys, fit_keys = acting.split_keys(loop.keys(trial))
             trials = loop.act(trial, state, act_keys, progress.tick)
             records.check_finite(trials, trial)
             acted = time.monotonic()
@@ -245,11 +245,6 @@ def _fan(keys: Array, ids: Sequence[int]) -> Array:
     for _ in keys.shape:
         fan = jax.vmap(fan, (0, None))
     return fan(keys, data)
-
-
-def _split(keys: Array) -> tuple[Array, Array]:
-    pairs = jax.vmap(jax.random.split)(keys.reshape(-1)).reshape(*keys.shape, 2)
-    return pairs[..., 0], pairs[..., 1]
 
 
 def _summary(rows: list[dict[str, Any]], names: Sequence[str], time: str) -> str:
