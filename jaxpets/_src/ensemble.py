@@ -138,6 +138,16 @@ def max_variance(params: EnsembleParams) -> Array:
     return jnp.exp(params.network.max_logvar)
 
 
+def imagined_range(config: EnsembleConfig, scaler: Scaler) -> tuple[Array, Array]:
+    """Returns the least and greatest observation `[D]` that is imagined."""
+    if config.state_margin is None:
+        return jnp.full_like(scaler.low, -jnp.inf), jnp.full_like(scaler.high, jnp.inf)
+    # Before any data the range is infinite; 0 times that would be NaN.
+    width = scaler.high - scaler.low
+    margin = config.state_margin * width if config.state_margin else 0.0
+    return scaler.low - margin, scaler.high + margin
+
+
 def ensemble(
     config: EnsembleConfig, space: ModelSpace, *, obs_size: int, action_size: int
 ) -> Ensemble:
@@ -214,10 +224,7 @@ def ensemble(
         next_obs = space.next_obs(obs, mean + jnp.exp(logvar / 2) * noise)
         if config.state_margin is None:
             return next_obs
-        low, high = params.scaler.low, params.scaler.high
-        # Before any data the range is infinite; 0 times that would be NaN.
-        margin = config.state_margin * (high - low) if config.state_margin else 0.0
-        return space.bound(next_obs, low - margin, high + margin)
+        return space.bound(next_obs, *imagined_range(config, params.scaler))
 
     def fit_scaler(data: Transition, size: Array) -> Scaler:
         check_array("data.obs", data.obs, ["C", obs_size])

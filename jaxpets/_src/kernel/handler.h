@@ -1,0 +1,72 @@
+// The rollout as an XLA custom call. Included last, after `launch` is declared.
+#pragma once
+
+#include <string>
+
+#include "rollout.h"
+#include "xla/ffi/api/ffi.h"
+
+namespace {
+
+namespace ffi = xla::ffi;
+
+int64_t product(ffi::AnyBuffer::Dimensions dims, size_t first, size_t last) {
+  int64_t result = 1;
+  for (size_t i = first; i < last; ++i) result *= dims[i];
+  return result;
+}
+
+// Elements to move along axis `axis` of an operand whose own shape has `rank` axes.
+int64_t batch_stride(const ffi::AnyBuffer& operand, size_t rank, size_t axis) {
+  const auto dims = operand.dimensions();
+  return dims[axis] == 1 ? 0 : product(dims, axis + 1, dims.size());
+}
+
+struct Problem {
+  Rollout rollout;
+  std::string error;
+};
+
+Problem read(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer keys,
+             ffi::AnyBuffer obs, ffi::AnyBuffer actions,
+             ffi::AnyBuffer path) {
+  const auto dims = path.dimensions();  // [..., N, H + 1, E, P, OBS]
+  const size_t axes = dims.size() - 5;
+  Rollout rollout = {};
+  if (axes > MAX_BATCH_AXES) return {rollout, "jax.vmap is nested too deeply"};
+  for (auto* operand : {&weights, &shared, &keys, &obs, &actions})
+    if (operand->dimensions().size() < axes) return {rollout, "an operand lacks an axis"};
+  rollout.weights = static_cast<const uint16_t*>(weights.untyped_data());
+  rollout.shared = static_cast<const float*>(shared.untyped_data());
+  rollout.keys = static_cast<const uint32_t*>(keys.untyped_data());
+  rollout.obs = static_cast<const float*>(obs.untyped_data());
+  rollout.actions = static_cast<const float*>(actions.untyped_data());
+  rollout.path = static_cast<float*>(path.untyped_data());
+  rollout.num_candidates = dims[axes];
+  rollout.horizon = dims[axes + 1] - 1;
+  rollout.num_members = dims[axes + 2];
+  rollout.particles = dims[axes + 3];
+  if (dims[axes + 4] != OBS ||
+      weights.dimensions()[axes + 1] != MEMBER_WEIGHTS ||
+      shared.dimensions()[axes] != SHARED_NUMBERS)
+    return {rollout, "the operands are those of another model"};
+  if (product(dims, axes, dims.size()) > INT32_MAX)
+    return {rollout, "a path has more than 2^31 numbers"};
+  rollout.batch = product(dims, 0, axes);
+  for (int axis = 0; axis < MAX_BATCH_AXES; ++axis) {
+    BatchAxis& out = rollout.axes[axis];
+    if (static_cast<size_t>(axis) >= axes) {
+      out = {1, 0, 0, 0, 0, 0};
+      continue;
+    }
+    out.size = dims[axis];
+    out.weights = batch_stride(weights, 2, axis);
+    out.shared = batch_stride(shared, 1, axis);
+    out.keys = batch_stride(keys, 2, axis);
+    out.obs = batch_stride(obs, 1, axis);
+    out.actions = batch_stride(actions, 3, axis);
+  }
+  return {rollout, ""};
+}
+
+}  // namespace

@@ -1,0 +1,100 @@
+// The same rollout in plain C++, from the same operands: what the GPU kernel computes,
+// without its instructions. For tests on machines without a GPU.
+
+#include "rollout.h"
+
+#include <vector>
+
+#include "handler.h"
+
+namespace {
+
+using Half = _Float16;
+
+// Weight (row, column) of a chunk; rows are the inner dimension of the product.
+float weight(const Half* chunk, int row, int column) {
+  return chunk[(column / 8 * 2 + row / 8) * 64 + column % 8 * 8 + row % 8];
+}
+
+std::vector<float> multiply(const std::vector<Half>& inputs, const Half* weights,
+                            int columns) {
+  std::vector<float> sums(columns, 0.0f);
+  for (size_t first = 0; first < inputs.size(); first += DEPTH)
+    for (int column = 0; column < columns; ++column)
+      for (int row = 0; row < DEPTH; ++row)
+        sums[column] += inputs[first + row] *
+                        weight(weights + first * columns, row, column);
+  return sums;
+}
+
+std::vector<Half> activate(const std::vector<float>& sums) {
+  std::vector<Half> activations(HIDDEN_CHUNKS * DEPTH, Half(0));
+  for (int i = 0; i < WIDTH; ++i)
+    activations[i] = Half(sums[i] + sums[i] * std::tanh(sums[i]));
+  activations[WIDTH] = activations[WIDTH + 1] = Half(1);
+  return activations;
+}
+
+void run_particle(const Rollout& rollout, int member, int particle) {
+  const int rows = rollout.num_candidates * rollout.particles;
+  const int candidate = particle / rollout.particles;
+  const int64_t stride = int64_t(rollout.num_members) * rollout.particles * OBS;
+  float* path = rollout.path + candidate * (rollout.horizon + 1) * stride +
+                (member * rollout.particles + particle % rollout.particles) * OBS;
+  float obs[OBS];
+  for (int i = 0; i < OBS; ++i) path[i] = obs[i] = rollout.obs[i];
+  for (int step = 0; step < rollout.horizon; ++step) {
+    const float* actions =
+        rollout.actions + (int64_t(candidate) * rollout.horizon + step) * ACTION;
+    const Half* weights =
+        reinterpret_cast<const Half*>(rollout.weights) + int64_t(member) * MEMBER_WEIGHTS;
+    float values[FEATURES];
+    features(obs, values);
+    std::vector<Half> inputs(INPUT_CHUNKS * DEPTH, Half(0));
+    for (int i = 0; i < INPUTS; ++i)
+      inputs[i] = Half(
+          scaled(i < FEATURES ? values[i] : actions[i - FEATURES], i, rollout.shared));
+    inputs[INPUTS] = inputs[INPUTS + 1] = Half(1);
+    std::vector<Half> activations = activate(multiply(inputs, weights, WIDTH));
+    weights += INPUT_WEIGHTS;
+    for (int layer = 1; layer < LAYERS; ++layer, weights += HIDDEN_WEIGHTS)
+      activations = activate(multiply(activations, weights, WIDTH));
+    const std::vector<float> head = multiply(activations, weights, 2 * HEAD);
+    float target[OBS];
+    for (int i = 0; i < OBS; ++i) {
+      const uint32_t counter = (uint32_t(member) * rows + particle) * OBS + i;
+      const float noise = normal(threefry_bits(rollout.keys[2 * step],
+                                               rollout.keys[2 * step + 1], counter));
+      target[i] = head[i] + noise * deviation(head[HEAD + i],
+                                              rollout.shared[MIN_VARIANCE + i],
+                                              rollout.shared[MAX_PRECISION + i]);
+    }
+    move(obs, target, rollout.shared);
+    for (int i = 0; i < OBS; ++i) path[(step + 1) * stride + i] = obs[i];
+  }
+}
+
+ffi::Error run(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer keys,
+               ffi::AnyBuffer obs, ffi::AnyBuffer actions,
+               ffi::Result<ffi::AnyBuffer> path) {
+  const Problem problem = read(weights, shared, keys, obs, actions, *path);
+  if (!problem.error.empty()) return ffi::Error::InvalidArgument(problem.error);
+  for (int64_t batch = 0; batch < problem.rollout.batch; ++batch) {
+    const Rollout rollout = at_batch(problem.rollout, batch);
+    for (int member = 0; member < rollout.num_members; ++member)
+      for (int row = 0; row < rollout.num_candidates * rollout.particles; ++row)
+        run_particle(rollout, member, row);
+  }
+  return ffi::Error::Success();
+}
+
+}  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
+                              ffi::Ffi::Bind()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Ret<ffi::AnyBuffer>());

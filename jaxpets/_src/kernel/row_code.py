@@ -1,0 +1,251 @@
+"""A function of one row of numbers, written as JAX, written out as C++.
+
+The rollout kernel steps one particle per thread. The coordinates of a model, its
+ModelSpace, are JAX functions; this turns their jaxprs into straight-line code over
+named scalars. What moves numbers around (slice, concatenate, reshape, indexing) costs
+nothing: it only says which name stands where.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+# One C++ expression per element; {0}, {1}, ... are the operands.
+_ELEMENTWISE = {
+    "abs": "fabsf({0})",
+    "add": "({0} + {1})",
+    "and": "({0} && {1})",
+    "atan2": "atan2f({0}, {1})",
+    "ceil": "ceilf({0})",
+    "clamp": "lower(higher({1}, {0}), {2})",
+    "copy": "{0}",
+    "cos": "cosf({0})",
+    "div": "({0} / {1})",
+    "eq": "({0} == {1})",
+    "exp": "expf({0})",
+    "floor": "floorf({0})",
+    "ge": "({0} >= {1})",
+    "gt": "({0} > {1})",
+    "is_finite": "(fabsf({0}) <= 3.402823466e38f)",
+    "le": "({0} <= {1})",
+    "log": "logf({0})",
+    "log1p": "log1pf({0})",
+    "logistic": "(1.0f / (1.0f + expf(-{0})))",
+    "lt": "({0} < {1})",
+    "max": "higher({0}, {1})",
+    "min": "lower({0}, {1})",
+    "mul": "({0} * {1})",
+    "ne": "({0} != {1})",
+    "neg": "(-{0})",
+    "not": "(!{0})",
+    "or": "({0} || {1})",
+    "pow": "powf({0}, {1})",
+    "rsqrt": "(1.0f / sqrtf({0}))",
+    "select_n": "({0} ? {2} : {1})",
+    "sin": "sinf({0})",
+    "sqrt": "sqrtf({0})",
+    "square": "({0} * {0})",
+    "stop_gradient": "{0}",
+    "sub": "({0} - {1})",
+    "tan": "tanf({0})",
+    "tanh": "tanhf({0})",
+}
+_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min"}
+# They only move elements: what they do to numbers, they do to names.
+_MOVES = {
+    "broadcast_in_dim",
+    "concatenate",
+    "dynamic_slice",
+    "expand_dims",
+    "gather",
+    "pad",
+    "reshape",
+    "rev",
+    "slice",
+    "split",
+    "squeeze",
+    "transpose",
+}
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+
+
+class UnsupportedError(Exception):
+    """A primitive that has no C++ here."""
+
+
+def row_function(
+    name: str, function: Callable[..., Any], sizes: Sequence[tuple[str, int]]
+) -> str:
+    """Returns C++ for a function of float32 vectors that returns one vector.
+
+    Args:
+      name: of the C++ function; its arguments are those of `function`, then `out`.
+      function: JAX code, traceable.
+      sizes: name and length of each argument.
+
+    Raises:
+      UnsupportedError: if the function does what has no C++ here: anything but
+        arithmetic on elements, moving them, and sums over them.
+    """
+    shapes = [jax.ShapeDtypeStruct((size,), jnp.float32) for _, size in sizes]
+    closed = jax.make_jaxpr(function)(*shapes)
+    writer = _Writer()
+    rows = [
+        np.array([f"{argument}[{i}]" for i in range(size)], dtype=object)
+        for argument, size in sizes
+    ]
+    (result,) = writer.run(closed.jaxpr, closed.consts, rows)
+    stores = [
+        f"out[{i}] = {_text(value)};" for i, value in enumerate(result.reshape(-1))
+    ]
+    arguments = [f"const float (&{argument})[{size}]" for argument, size in sizes]
+    arguments.append(f"float (&out)[{result.size}]")
+    body = "\n  ".join([*writer.lines, *stores])
+    return f"ROW_FUNCTION void {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
+
+
+class _Writer:
+    """Walks a jaxpr; arrays hold numbers where known, C++ names where not."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def run(self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list:
+        known: dict[Any, np.ndarray] = {}
+
+        def read(atom: Any) -> np.ndarray:
+            return np.asarray(atom.val) if isinstance(atom, core.Literal) else known[atom]
+
+        known |= dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+        known |= dict(zip(jaxpr.invars, args, strict=True))
+        for eqn in jaxpr.eqns:
+            inputs = [read(atom) for atom in eqn.invars]
+            results = self._equation(eqn, inputs)
+            known |= dict(zip(eqn.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def _equation(self, eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        name = eqn.primitive.name
+        if name in _CALLS:
+            inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+            return self.run(inner.jaxpr, inner.consts, inputs)
+        if all(array.dtype != object for array in inputs):
+            return _bind(eqn, inputs)
+        if name in _MOVES:
+            return _move(eqn, inputs)
+        if name == "convert_element_type":
+            return [self._convert(eqn, inputs[0])]
+        if name == "integer_pow":
+            return [self._power(inputs[0], eqn.params["y"])]
+        if name in _REDUCTIONS:
+            return [self._reduce(eqn, inputs[0])]
+        if name in _ELEMENTWISE:
+            return [self._elementwise(name, eqn.outvars[0].aval, inputs)]
+        raise UnsupportedError(f"the primitive {name!r} has no C++ form")
+
+    def _assign(self, kind: str, expression: str) -> str:
+        name = f"v{len(self.lines)}"
+        self.lines.append(f"const {kind} {name} = {expression};")
+        return name
+
+    def _elementwise(self, name: str, aval: Any, inputs: list) -> np.ndarray:
+        kind = _kind(aval.dtype)
+        result = np.empty(aval.shape, dtype=object)
+        operands = [np.broadcast_to(array, aval.shape) for array in inputs]
+        for index in np.ndindex(aval.shape):
+            texts = [_text(operand[index]) for operand in operands]
+            result[index] = self._assign(kind, _ELEMENTWISE[name].format(*texts))
+        return result
+
+    def _convert(self, eqn: Any, array: np.ndarray) -> np.ndarray:
+        kind = _kind(eqn.params["new_dtype"])
+        if kind == _kind(eqn.invars[0].aval.dtype):
+            return array
+        result = np.empty(array.shape, dtype=object)
+        for index in np.ndindex(array.shape):
+            result[index] = self._assign(kind, f"({kind})({_text(array[index])})")
+        return result
+
+    def _power(self, array: np.ndarray, exponent: int) -> np.ndarray:
+        result = np.empty(array.shape, dtype=object)
+        for index in np.ndindex(array.shape):
+            product = " * ".join([_text(array[index])] * abs(exponent)) or "1.0f"
+            text = f"(1.0f / ({product}))" if exponent < 0 else product
+            result[index] = self._assign("float", text)
+        return result
+
+    def _reduce(self, eqn: Any, array: np.ndarray) -> np.ndarray:
+        axes = tuple(eqn.params["axes"])
+        kept = [axis for axis in range(array.ndim) if axis not in axes]
+        moved = array.transpose(*kept, *axes).reshape(*eqn.outvars[0].aval.shape, -1)
+        expression = _ELEMENTWISE[_REDUCTIONS[eqn.primitive.name]]
+        result = np.empty(moved.shape[:-1], dtype=object)
+        for index in np.ndindex(result.shape):
+            total, *rest = map(_text, moved[index])
+            for text in rest:
+                total = self._assign("float", expression.format(total, text))
+            result[index] = total
+        return result
+
+
+def _bind(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Runs a primitive on numbers, now."""
+    with jax.ensure_compile_time_eval():
+        results = eqn.primitive.bind(*map(jnp.asarray, inputs), **eqn.params)
+    results = results if eqn.primitive.multiple_results else [results]
+    return [np.asarray(result) for result in results]
+
+
+def _move(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Runs a primitive on the positions of elements and looks the elements up."""
+    pool: list[Any] = []
+    places = []
+    for array, atom in zip(inputs, eqn.invars, strict=True):
+        if jnp.issubdtype(atom.aval.dtype, jnp.integer):
+            if array.dtype == object:
+                raise UnsupportedError("an index that depends on the state")
+            places.append(array)  # where to read, not what
+            continue
+        first = len(pool)
+        pool.extend(array.reshape(-1))
+        places.append(np.arange(first, len(pool), dtype=np.int32).reshape(array.shape))
+    params = dict(eqn.params)
+    if eqn.primitive.name == "gather":
+        params["fill_value"] = None
+    with jax.ensure_compile_time_eval():
+        results = eqn.primitive.bind(*map(jnp.asarray, places), **params)
+    results = results if eqn.primitive.multiple_results else [results]
+    values = np.empty(len(pool), dtype=object)
+    values[:] = pool
+    return [
+        values[np.asarray(result).reshape(-1)].reshape(result.shape)
+        for result in results
+    ]
+
+
+def _kind(dtype: Any) -> str:
+    if dtype == jnp.bool_:
+        return "bool"
+    if dtype == jnp.float32:
+        return "float"
+    raise UnsupportedError(f"values of type {dtype}")
+
+
+def _text(value: Any) -> str:
+    """Returns a C++ name or literal."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (bool, np.bool_)):
+        return "true" if value else "false"
+    number = float(value)
+    if math.isnan(number):
+        return "NAN"
+    if math.isinf(number):
+        return "INFINITY" if number > 0 else "(-INFINITY)"
+    text = float(np.float32(number)).hex()
+    return f"({text}f)" if number < 0 else f"{text}f"
