@@ -1,7 +1,9 @@
-"""Speed of HalfCheetah: MJX over batch sizes, and C MuJoCo on one core beside it.
+"""Speed of HalfCheetah over batch sizes: MJX beside C MuJoCo, both as an Env in jit.
 
-One environment step is five steps of physics. C MuJoCo runs gymnasium's solver
-settings; both run random actions, from a state that was reached by random actions.
+One environment step is five steps of physics. All run random actions, from a state that
+was reached by random actions. C MuJoCo has gymnasium's solver settings and all cores
+(mujoco); a plain loop over one environment on one core, without JAX, is its floor
+(mujoco-loop; rows older than the engine mujoco have it by that name).
 """
 
 import argparse
@@ -19,18 +21,24 @@ from jaxpets.envs import half_cheetah
 
 COLUMNS = ("engine", "batch", "compile_s", "min_ms", "median_ms", "ms_per_step",
            "env_steps_per_s")  # fmt: skip
+ENGINES = {
+    "mjx": half_cheetah.half_cheetah,
+    "mujoco": half_cheetah.half_cheetah_native,
+}
 FRAME_SKIP = 5
 
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yields a row for every batch size, then one for C MuJoCo."""
+    """Yields a row for every engine and batch size, then one for the plain loop."""
     steps = 3 if args.tiny else args.steps
-    for batch in [1] if args.tiny else args.batch:
-        result = timing.repeat(*mjx_call(batch, steps), repeats=args.repeats)
-        yield env_row("mjx", batch, steps, result)
-    steps *= 20  # so that a run of the faster engine is not over at once
-    result = timing.repeat(mujoco_call(steps), repeats=args.repeats)
-    yield env_row("mujoco", 1, steps, result)
+    for engine, build in ENGINES.items():
+        env = build()
+        for batch in [1] if args.tiny else args.batch:
+            result = timing.repeat(*env_call(env, batch, steps), repeats=args.repeats)
+            yield env_row(engine, batch, steps, result)
+    steps *= 20  # so that a run of the fastest is not over at once
+    result = timing.repeat(loop_call(steps), repeats=args.repeats)
+    yield env_row("mujoco-loop", 1, steps, result)
 
 
 def env_row(
@@ -47,9 +55,10 @@ def env_row(
     )
 
 
-def mjx_call(batch: int, steps: int) -> tuple[Callable[[], Any], float]:
+def env_call(
+    env: jaxpets.Env, batch: int, steps: int
+) -> tuple[Callable[[], Any], float]:
     """Returns `steps` steps of a batch in one program, and its seconds of compiling."""
-    env = half_cheetah.half_cheetah()
     keys = jax.random.split(jax.random.key(0), batch)
     shape = (steps, batch, half_cheetah.ACTION_SIZE)
     actions = jax.random.uniform(jax.random.key(1), shape, jnp.float32, -1.0, 1.0)
@@ -68,7 +77,7 @@ def mjx_call(batch: int, steps: int) -> tuple[Callable[[], Any], float]:
     return lambda: program(state, actions), compile_s
 
 
-def mujoco_call(steps: int) -> Callable[[], None]:
+def loop_call(steps: int) -> Callable[[], None]:
     """Returns `steps` steps of one environment in C, on one core."""
     model = half_cheetah.load_model()
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]

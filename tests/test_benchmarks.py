@@ -153,7 +153,8 @@ def test_env_and_trial(tmp_path):
     path = tmp_path / "rows.jsonl"
     common = ["--tiny", "--repeats", "2", "--json", str(path)]
     found = env.main(common)
-    assert [row["sizes"]["engine"] for row in found] == ["mjx", "mujoco"]
+    engines = ["mjx", "mujoco", "mujoco-loop"]
+    assert [row["sizes"]["engine"] for row in found] == engines
     check_rows(found, path, {"ms_per_step", "env_steps_per_s"})
     found = trial.main(common)
     check_rows(found, path, {"unroll_s", "ms_per_step", "fit_s", "trial_s"})

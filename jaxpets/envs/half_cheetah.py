@@ -1,4 +1,4 @@
-"""HalfCheetah as PETS has it: the model of gymnasium, stepped by MJX on any device.
+"""HalfCheetah as PETS has it: the model of gymnasium, stepped by MJX or C MuJoCo.
 
 Differences to other HalfCheetahs: the observation has 18 entries and begins with the
 forward velocity over the whole environment step; every trial starts within 0.001 of
@@ -8,6 +8,7 @@ the same state; nothing ends a trial; all geoms hit the floor (not so in Brax).
 import contextlib
 import importlib.resources
 import io
+from collections.abc import Callable
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
@@ -18,6 +19,7 @@ from jax import Array
 
 from jaxpets._src.checks import check_array, check_count
 from jaxpets._src.types import Env, EnvState, ModelSpace
+from jaxpets.envs.native import native_physics
 
 OBS_SIZE = 18
 ACTION_SIZE = 6
@@ -176,23 +178,8 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     host_model.opt.ls_iterations = ls_iterations
     model = mjx.put_model(host_model, impl="jax")
     template = mjx.make_data(host_model, impl="jax")
-    qpos0 = jnp.asarray(host_model.qpos0, jnp.float32)
 
-    def observe(velocity: Array, physics: Physics) -> Array:
-        return jnp.concatenate([velocity[None], physics.qpos[1:], physics.qvel])
-
-    def reset(key: Array) -> EnvState:
-        qpos_key, qvel_key = jax.random.split(key)
-        physics = Physics(
-            qpos=qpos0 + _RESET_STD * jax.random.normal(qpos_key, (9,), jnp.float32),
-            qvel=_RESET_STD * jax.random.normal(qvel_key, (9,), jnp.float32),
-            qacc_warmstart=jnp.zeros((9,), jnp.float32),
-        )
-        return EnvState(observe(jnp.zeros((), jnp.float32), physics), physics)
-
-    def step(state: EnvState, action: Array) -> EnvState:
-        check_array("action", action, [ACTION_SIZE])
-        before = state.physics
+    def advance(before: Physics, action: Array) -> Physics:
         data = template.replace(
             qpos=before.qpos,
             qvel=before.qvel,
@@ -208,8 +195,61 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
             data = jax.lax.fori_loop(
                 0, _FRAME_SKIP, lambda _, data: mjx.step(model, data), data
             )
-        physics = Physics(data.qpos, data.qvel, data.qacc_warmstart)
-        velocity = (physics.qpos[0] - before.qpos[0]) / TIMESTEP
+        return Physics(data.qpos, data.qvel, data.qacc_warmstart)
+
+    return _env(host_model, advance)
+
+
+def half_cheetah_native(*, num_threads: int | None = None) -> Env:
+    """Builds HalfCheetah on C MuJoCo, with the solver settings of gymnasium.
+
+    For batches too small to fill a GPU: every step is computed on the host, in double
+    precision, while the device waits. A state that has blown up is NaN from there on,
+    as with MJX. JAX needs its CPU backend for this, so a JAX_PLATFORMS that is set must
+    list cpu.
+
+    Args:
+      num_threads: over which a batch is spread; by default all cores.
+
+    Returns:
+      An Env as that of `half_cheetah`, with the same states, and the same start for the
+      same key.
+
+    Raises:
+      TypeError, ValueError: unless num_threads is None or a positive Python integer.
+    """
+    model = load_model()
+    physics_fn = native_physics(
+        model, num_substeps=_FRAME_SKIP, num_threads=num_threads
+    )
+
+    def advance(before: Physics, action: Array) -> Physics:
+        # MuJoCo clips as well, but takes an infinite control for 0.
+        return Physics(*physics_fn(*before, jnp.clip(action, -1.0, 1.0)))
+
+    return _env(model, advance)
+
+
+def _env(model: Any, advance: Callable[[Physics, Array], Physics]) -> Env:
+    """Builds the environment around what moves the physics by one step."""
+    qpos0 = jnp.asarray(model.qpos0, jnp.float32)
+
+    def observe(velocity: Array, physics: Physics) -> Array:
+        return jnp.concatenate([velocity[None], physics.qpos[1:], physics.qvel])
+
+    def reset(key: Array) -> EnvState:
+        qpos_key, qvel_key = jax.random.split(key)
+        physics = Physics(
+            qpos=qpos0 + _RESET_STD * jax.random.normal(qpos_key, (9,), jnp.float32),
+            qvel=_RESET_STD * jax.random.normal(qvel_key, (9,), jnp.float32),
+            qacc_warmstart=jnp.zeros((9,), jnp.float32),
+        )
+        return EnvState(observe(jnp.zeros((), jnp.float32), physics), physics)
+
+    def step(state: EnvState, action: Array) -> EnvState:
+        check_array("action", action, [ACTION_SIZE])
+        physics = advance(state.physics, action)
+        velocity = (physics.qpos[0] - state.physics.qpos[0]) / TIMESTEP
         return EnvState(observe(velocity, physics), physics)
 
     low = -jnp.ones((ACTION_SIZE,), jnp.float32)
