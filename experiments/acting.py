@@ -1,4 +1,4 @@
-"""Trials of many planners at once: one jitted program, called in chunks."""
+"""Trials of many planners at once: one program per device, called in chunks."""
 
 import functools
 from collections.abc import Callable
@@ -7,8 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import PartitionSpec as P
 
 import jaxpets
+from experiments import devices
+from experiments.devices import AXES, SEED, TASK, Spread
 from jaxpets.envs import half_cheetah
 
 # Called between chunks with the environment steps done; may raise to stop the run.
@@ -20,10 +23,12 @@ class Actors(NamedTuple):
 
     start: `(keys) -> UnrollState`.
     chunk: `(PlanParams, keys, UnrollState) -> (UnrollState, Transition, values)`.
+    place: `(keys) -> keys`, takes those of all actors to where each of them acts.
     """
 
     start: Callable[..., Any]
     chunk: Callable[..., Any]
+    place: Callable[[Array], Array]
 
 
 class Trials(NamedTuple):
@@ -34,11 +39,13 @@ class Trials(NamedTuple):
 
 
 def explorers(
-    env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int
-) -> Actors:
+    env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int,
+    spread: Spread,
+) -> Actors:  # fmt: skip
     """Returns actors over seeds `[S]`; params and reward data are per seed."""
     start, chunk = _one(env, planner, horizon, length)
-    return Actors(jax.jit(jax.vmap(start)), jax.jit(jax.vmap(chunk)))
+    params = jaxpets.PlanParams(P(SEED), P(SEED))
+    return _spread(spread, jax.vmap(start), jax.vmap(chunk), params, SEED)
 
 
 def performers(
@@ -46,6 +53,7 @@ def performers(
     planner: jaxpets.Planner,
     horizon: int,
     length: int,
+    spread: Spread,
     *,
     shared_model: bool,
 ) -> Actors:
@@ -60,7 +68,9 @@ def performers(
     over_tasks = jax.vmap(over_trials, (jaxpets.PlanParams(model, 0), 0, 0))
     over_seeds = jax.vmap(over_tasks, (jaxpets.PlanParams(0, None), 0, 0))
     starts = jax.vmap(jax.vmap(jax.vmap(start)))
-    return Actors(jax.jit(starts), jax.jit(over_seeds))
+    models = P(SEED) if shared_model else P(SEED, TASK)
+    params = jaxpets.PlanParams(models, P(TASK))
+    return _spread(spread, starts, over_seeds, params, *AXES)
 
 
 def run(
@@ -75,11 +85,14 @@ def run(
     Args:
       actors: what to call.
       params: forwarded.
-      keys: one per actor; consumed.
+      keys: one per actor, of all hosts; consumed.
       num_chunks: calls that make a trial.
       tick: called after every chunk with the steps of one actor.
+
+    Returns:
+      The trials of this host's actors, on its devices.
     """
-    reset_keys, act_keys = split_keys(keys)
+    reset_keys, act_keys = map(actors.place, split_keys(keys))
     state = actors.start(reset_keys)
     chunks = []
     for _ in range(num_chunks):
@@ -107,9 +120,26 @@ def score(transitions: jaxpets.Transition) -> tuple[Array, Array]:
     return jnp.sum(rewards, axis=-2), turns
 
 
+def _spread(
+    spread: Spread, starts: Callable[..., Any], chunks: Callable[..., Any],
+    params: jaxpets.PlanParams, *axes: str,
+) -> Actors:  # fmt: skip
+    """Returns actors over `axes`; params holds the axes of what they read."""
+    every = P(*axes)
+    start = devices.split(spread, starts, every, every)
+    chunk = devices.split(spread, chunks, (params, every, every), every)
+    return Actors(
+        jax.jit(start),
+        jax.jit(chunk),
+        lambda keys: devices.place(spread, keys, *axes),
+    )
+
+
 def _one(
     env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int
-) -> Actors:
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Returns `start` and `chunk` of one actor."""
+
     def chunk(
         params: jaxpets.PlanParams, key: Array, state: jaxpets.UnrollState
     ) -> tuple[jaxpets.UnrollState, jaxpets.Transition, Array]:
@@ -118,4 +148,4 @@ def _one(
         )
         return state, transitions, plans.value / horizon
 
-    return Actors(functools.partial(jaxpets.start, env, planner), chunk)
+    return functools.partial(jaxpets.start, env, planner), chunk

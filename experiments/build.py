@@ -20,6 +20,11 @@ Learn = Callable[[Array, State, jaxpets.Transition], tuple[State, Any]]
 # Every phase draws from its own stream of keys.
 EXPLORE, ZERO_SHOT, FINETUNE = 0, 1, 2
 
+ENGINES = {
+    "mjx": half_cheetah.half_cheetah,
+    "mujoco": half_cheetah.half_cheetah_native,
+}
+
 
 # A learner over seeds: all have equally many transitions.
 _MAPPED: Any = 0
@@ -39,7 +44,7 @@ class Parts(NamedTuple):
 
 def build(config: Config) -> Parts:
     """Returns the parts for a validated config."""
-    env = half_cheetah.half_cheetah()
+    env = ENGINES[config.engine]()
     numbers = config.model
     size = jaxpets.EnsembleConfig(
         num_members=numbers.num_members,
@@ -59,13 +64,7 @@ def build(config: Config) -> Parts:
     finetuned = config.finetune_trials * config.task_length
 
     def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
-        model = _ensemble(size, jaxpets.Precision(search.precision))
-        rollout = jaxpets.particle_rollout(
-            model.sample,
-            num_members=numbers.num_members,
-            num_particles=search.num_particles,
-        )
-        return jaxpets.plan(rollout, reward_fn, _optimizer(search, env))
+        return jaxpets.plan(_rollout(size, search), reward_fn, _optimizer(search, env))
 
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
@@ -124,6 +123,24 @@ def _ensemble(
         half_cheetah.model_space(),
         obs_size=half_cheetah.OBS_SIZE,
         action_size=half_cheetah.ACTION_SIZE,
+    )
+
+
+def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.RolloutFn:
+    precision = jaxpets.Precision(search.precision)
+    is_bf16 = precision is jaxpets.Precision.BF16
+    if search.fused and is_bf16 and jax.default_backend() == "gpu":
+        return jaxpets.fused_rollout(
+            dataclasses.replace(size, precision=precision),
+            half_cheetah.model_space(),
+            obs_size=half_cheetah.OBS_SIZE,
+            action_size=half_cheetah.ACTION_SIZE,
+            num_particles=search.num_particles,
+        )
+    return jaxpets.particle_rollout(
+        _ensemble(size, precision).sample,
+        num_members=size.num_members,
+        num_particles=search.num_particles,
     )
 
 

@@ -39,6 +39,8 @@ from experiments.storage import (
 
 __all__ = ["restore", "save", "steps", "supersede"]
 
+_FIRST = ocp.options.MultiprocessingOptions(0, {0}, "first")  # no other host is here
+
 
 class _DamagedError(Exception):
     """A step that is not what was written; the message says where."""
@@ -59,7 +61,7 @@ def save(
     Args:
       directory: Of all steps; created if need be.
       step: Newer than every step there.
-      state: A pytree of jax arrays, on any device; typed keys are fine.
+      state: A pytree of arrays, on any device; typed keys are fine.
       meta: JSON values to come back from `restore`; no NaN.
       finite: A part of the state whose floats must be finite.
       keep: Number of newest steps to keep, the new one included.
@@ -184,8 +186,7 @@ def _commit(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     draft = directory / f".saving-{step}"
     items = ocp.args.Composite(
-        state=ocp.args.StandardSave(_storable(arrays)),
-        meta=ocp.args.JsonSave(body),
+        state=ocp.args.StandardSave(_storable(arrays)), meta=ocp.args.JsonSave(body)
     )
     with _quiet_orbax() as orbax:
         orbax.save(draft, args=items)
@@ -284,13 +285,15 @@ def _read_items(folder: Path, **items: Any) -> Any:
 @contextlib.contextmanager
 def _quiet_orbax() -> Iterator[ocp.Checkpointer]:
     """Yields a new checkpointer; a failed read can spoil the next one of the same."""
+    alone = ocp.CompositeOptions(multiprocessing_options=_FIRST)
+    handler = ocp.CompositeCheckpointHandler(composite_options=alone)
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
         with (
             warnings.catch_warnings(action="ignore"),
-            ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as orbax,
+            ocp.Checkpointer(handler, multiprocessing_options=_FIRST) as orbax,
         ):
             yield orbax
     finally:

@@ -14,9 +14,14 @@ import tyro
 from experiments import rundir
 from experiments.config import PRESETS, Config, ranges, validate
 from experiments.errors import CheckpointError, UsageError
+from experiments.hosts import Place
 
+# What belongs to a process and not to its run.
+_PLACE = Place._fields
 # Where a run that is continued may differ from its start.
-CONTINUED = ("out", "name", "video", "allow_cpu", "debug", "chunk_length", "source")
+CONTINUED = (
+    "out", "name", "video", "allow_cpu", "debug", "chunk_length", "source", *_PLACE,
+)  # fmt: skip
 
 
 def parse(argv: Sequence[str]) -> Config:
@@ -41,6 +46,23 @@ def parse(argv: Sequence[str]) -> Config:
         _check_same_run(config, default)
     validate(config)
     return config
+
+
+def place(argv: Sequence[str]) -> Place | None:
+    """Returns which process of several this one is; None if it is alone.
+
+    Raises:
+      UsageError: with one line for the user.
+      SystemExit: after `--help`.
+    """
+    flags = {"--" + name.replace("_", "-") for name in _PLACE}
+    if flags.isdisjoint(arg.partition("=")[0] for arg in _joined(argv)):
+        return None
+    config = _tyro(argv, PRESETS[_first_flags(argv).preset])
+    found = Place(*(getattr(config, name) for name in _PLACE))
+    _check_place(found, config.phase)
+    auto = found.coordinator_address == "auto"
+    return Place(None, None, None) if auto else found
 
 
 def explored_run(config: Config) -> Path:
@@ -108,6 +130,29 @@ def differences(
     return lines
 
 
+def _check_place(place: Place, phase: str) -> None:
+    address, count, own = place
+    if address in (None, "auto"):
+        alone = "left out, unless --coordinator-address is HOST:PORT"
+        _require(count is None, "--num-processes", count, alone)
+        _require(own is None, "--process-id", own, alone)
+    else:
+        named = re.fullmatch(r"\S+:[0-9]{1,5}", str(address)) is not None
+        _require(named, "--coordinator-address", address, "HOST:PORT or auto")
+        given = "1 or more, with --coordinator-address"
+        _require(count is not None and count > 0, "--num-processes", count, given)
+        below = count is not None and own is not None and 0 <= own < count
+        valid = f"0 to one less than --num-processes ({count})"
+        _require(below, "--process-id", own, valid)
+    one = phase != "report" or address is None
+    _require(one, "--coordinator-address", address, "left out in report")
+
+
+def _require(holds: bool, flag: str, value: Any, valid: str) -> None:
+    if not holds:
+        raise UsageError(f"{flag} {value} is not valid; it must be {valid}.")
+
+
 def _first_flags(argv: Sequence[str]) -> argparse.Namespace:
     """Reads the flags that decide about the defaults of the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -161,7 +206,8 @@ def _explored(first: argparse.Namespace, default: Config) -> Config:
             f"there is no exploration run in {folder}. Run --phase explore first, or "
             "name a run with --from."
         )
-    return from_json(rundir.read_json(path), default)
+    explored = from_json(rundir.read_json(path), default)
+    return dataclasses.replace(explored, **dict.fromkeys(_PLACE))
 
 
 def _tyro(argv: Sequence[str], default: Config) -> Config:

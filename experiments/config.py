@@ -11,6 +11,7 @@ from experiments.errors import UsageError
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
 ArmName = Literal["epistemic", "count", "random", "oracle", "one-step"]
+EngineName = Literal["mjx", "mujoco"]
 TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
 
 
@@ -71,6 +72,8 @@ class PlannerNumbers:
     """mppi: 0.1 follows the few best candidates, 10 averages over all."""
     precision: Literal["f32", "tf32", "bf16"] = "bf16"
     """Of the matrix products while planning; training always uses tf32 or better."""
+    fused: bool = True
+    """With bf16: imagine in one kernel, on GPUs that can (H100, H200)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,8 +122,18 @@ class Config:
     """Environment steps per call of the compiled program."""
     milestones: tuple[int, ...] = (10, 20, 26, 40)
     """Trials whose checkpoints are kept for good; otherwise the last two are."""
+    engine: EngineName = "mjx"
+    """What steps the physics: mjx on the device of the program, or mujoco, which is C
+    on the cores of the host."""
     num_bits: int = number(32, 1, 32)
     """count: bits of the hash."""
+    coordinator_address: str | None = None
+    """HOST:PORT of process 0, where several processes share the seeds; the same command
+    on each. auto: as SLURM, Open MPI or Kubernetes say, a process per GPU."""
+    num_processes: int | None = number(None, 1, 100_000)
+    """How many processes share the seeds."""
+    process_id: int | None = number(None, 0, 99_999)
+    """Which of them this is; only the folder of process 0 is used."""
     allow_cpu: bool = False
     """Start on a CPU although it would take over an hour."""
     debug: bool = False

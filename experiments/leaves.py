@@ -1,4 +1,4 @@
-"""Pytrees of jax arrays as flat dictionaries of NumPy arrays, and back.
+"""Pytrees of arrays as flat dictionaries of NumPy arrays, and back.
 
 On disk neither a state's devices nor its pytree classes matter: a leaf has a path,
 such as `params/w1`, a shape, a dtype and, if it is a typed key, an implementation.
@@ -27,7 +27,7 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
         name = jax.tree_util.keystr(path, simple=True, separator="/") or "state"
         if name in named:
             raise ValueError(f"two leaves of the state are called {name!r}")
-        if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
+        if not isinstance(leaf, jax.Array | np.ndarray | jax.ShapeDtypeStruct):
             raise TypeError(f"{name} is a {type(leaf).__name__}, want a jax array")
         named[name] = leaf
     return named

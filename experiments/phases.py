@@ -5,53 +5,41 @@ trials are the leading axes of every array.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import acting, checkpoint, records, rundir
+from experiments import acting, devices, hosts, loop, records, rundir
 from experiments.acting import Tick, Trials
 from experiments.build import (
     EXPLORE,
     FINETUNE,
     LEARNER_AXES,
     ZERO_SHOT,
-    Learn,
     Parts,
     State,
     build,
-    over_seeds,
     trial_keys,
 )
 from experiments.config import Config
+from experiments.devices import SEED, TASK, Spread
+from experiments.loop import Loop, Say
 from experiments.progress import Progress
 from jaxpets.envs import half_cheetah
-
-Say = Callable[[str], None]
-
-
-class Loop(NamedTuple):
-    """What explore and finetune do not share."""
-
-    what: str
-    trial_length: int
-    keys: Callable[[int], Array]  # trial -> keys of the branches
-    act: Callable[[int, State, Array, Tick], Trials]
-    learn: Learn
-    labels: Callable[[int], list[dict[str, Any]]]  # of the branches
 
 
 def explore(config: Config, folder: Path, say: Say) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
-    random = acting.explorers(parts.env, parts.random, 1, config.chunk_length)
+    spread = _spread(say, len(config.seeds))
+    random = acting.explorers(parts.env, parts.random, 1, config.chunk_length, spread)
     planned = acting.explorers(
-        parts.env, parts.explorer, config.planner.horizon, config.chunk_length
+        parts.env, parts.explorer, config.planner.horizon, config.chunk_length, spread
     )
 
     def act(trial: int, state: State, keys: Array, tick: Tick) -> Trials:
@@ -70,13 +58,13 @@ def explore(config: Config, folder: Path, say: Say) -> None:
             for seed in config.seeds
         ]
 
-    learn = jax.jit(
-        over_seeds(parts.learner.learn, len(config.seeds)), donate_argnums=1
-    )
+    learn = loop.learner(spread, parts.learner.learn, SEED)
     keys = lambda trial: trial_keys(config, EXPLORE, trial)  # noqa: E731
     init = jax.jit(jax.vmap(parts.learner.init, out_axes=LEARNER_AXES))(keys(0))
-    loop = Loop("explore", config.trial_length, keys, act, learn, labels)
-    _run(config, folder, loop, init, 0, config.num_trials, say)
+    own = Loop(
+        "explore", config.trial_length, spread, (SEED,), keys, act, learn, labels
+    )
+    loop.run(config, folder, own, init, 0, config.num_trials, say)
 
 
 def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -> None:
@@ -85,24 +73,28 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
     The jump-start of Table 1.
     """
     log = folder / "metrics.jsonl"
-    if rundir.log_size(log):  # written once, at the end
+    if hosts.on_first(lambda: rundir.log_size(log)):  # written once, at the end
         say(f"already complete: {config.eval_trials} of {config.eval_trials} trials.")
         return
     parts = build(config)
     state = _explored(config, source, step, parts, say)
     names, weights = _tasks(config)
+    spread = _spread(say, len(config.seeds), len(names), config.eval_trials)
     actors = acting.performers(
         parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
-        shared_model=True,
+        spread, shared_model=True,
     )  # fmt: skip
     keys = _fan(trial_keys(config, ZERO_SHOT, step), _task_ids(names))
     keys = _fan(keys, range(config.eval_trials))
-    params = jaxpets.PlanParams(state.params, weights)
+    params = jaxpets.PlanParams(
+        devices.place(spread, state.params, SEED), devices.place(spread, weights, TASK)
+    )
     num_chunks = config.task_length // config.chunk_length
     progress = Progress(config.task_length, 0, "zero-shot")
     begin = time.monotonic()
     with progress.interruptible():
         trials = acting.run(actors, params, keys, num_chunks, progress.tick)
+    trials = devices.collect(spread, trials, *devices.AXES)
     records.check_finite(trials, step)
     common = {"phase": "zero-shot", "arm": config.arm, "explored_trials": step}
     labels = [
@@ -112,8 +104,9 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
         for trial in range(config.eval_trials)
     ]
     rows = records.rows(labels, trials)
-    records.save_paths(folder / "trajectories.npz", trials, config.seeds, names)
-    rundir.append_rows(log, rows)
+    paths = folder / "trajectories.npz"
+    hosts.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
+    hosts.on_first(lambda: rundir.append_rows(log, rows))
     say(_summary(rows, names, f"{time.monotonic() - begin:.0f} s"))
 
 
@@ -124,9 +117,11 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
     """
     parts = build(config)
     names, weights = _tasks(config)
+    spread = _spread(say, len(config.seeds), len(names))
+    weights = devices.place(spread, weights, TASK)
     actors = acting.performers(
         parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
-        shared_model=False,
+        spread, shared_model=False,
     )  # fmt: skip
 
     def act(trial: int, state: State, keys: Array, tick: Tick) -> Trials:
@@ -135,7 +130,7 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
         keys = keys[..., None]
         num_chunks = config.task_length // config.chunk_length
         trials = acting.run(actors, params, keys, num_chunks, tick)
-        return jax.tree.map(lambda x: x[:, :, 0], trials)
+        return jax.tree.map(lambda x: x.squeeze(2), trials)
 
     def labels(trial: int) -> list[dict[str, Any]]:
         common = {"phase": "finetune", "arm": config.arm, "explored_trials": step}
@@ -145,56 +140,28 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
             for task in names
         ]
 
-    learn = over_seeds(parts.finetuner.learn, len(names))
-    learn = over_seeds(learn, len(config.seeds))
-    learn = jax.jit(learn, donate_argnums=1)
+    learn = loop.learner(spread, parts.finetuner.learn, SEED, TASK)
     keys = lambda trial: _fan(trial_keys(config, FINETUNE, trial), _task_ids(names))  # noqa: E731
     explored = _explored(config, source, step, parts, say)
     capacity = explored.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
     init = _branch(explored, len(names), capacity)
-    loop = Loop("finetune", config.task_length, keys, act, learn, labels)
+    axes = (SEED, TASK)
+    own = Loop("finetune", config.task_length, spread, axes, keys, act, learn, labels)
     last = step + config.finetune_trials
-    trials = _run(config, folder, loop, init, step, last, say)
+    trials = loop.run(config, folder, own, init, step, last, say)
     if trials is not None:
         trials = jax.tree.map(lambda x: x[:, :, None], trials)
-        records.save_paths(folder / "trajectories.npz", trials, config.seeds, names)
+        paths = folder / "trajectories.npz"
+        hosts.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
 
 
-def _run(
-    config: Config, folder: Path, loop: Loop, init: State, first: int, last: int,
-    say: Say,
-) -> Trials | None:  # fmt: skip
-    """Runs trials `first + 1` to `last`, or what is left of them; saves after each."""
-    checkpoints, log = folder / "checkpoints", folder / "metrics.jsonl"
-    found = checkpoint.restore(checkpoints, init, warn=_warning(say))
-    done, state, meta = found or (first, init, {"log": 0})
-    rundir.cut_log(log, meta["log"])
-    if done >= last:
-        say(f"already complete: {last - first} of {last - first} trials.")
-        return None
-    steps = loop.trial_length
-    progress = Progress((last - first) * steps, (done - first) * steps, loop.what)
-    trials = None
-    with progress.interruptible():
-        for trial in range(done + 1, last + 1):
-            begin = time.monotonic()
-            act_keys, fit_keys = acting.split_keys(loop.keys(trial))
-            trials = loop.act(trial, state, act_keys, progress.tick)
-            records.check_finite(trials, trial)
-            acted = time.monotonic()
-            state, fit = loop.learn(fit_keys, state, trials.transitions)
-            jax.block_until_ready(state)
-            seconds = {"act": acted - begin, "fit": time.monotonic() - acted}
-            rows = records.rows(loop.labels(trial), trials, fit, state.params)
-            rundir.append_rows(log, [{**row, "seconds": seconds} for row in rows])
-            checkpoint.save(
-                checkpoints, trial, state, {"log": rundir.log_size(log)},
-                milestones=config.milestones, finite=(state.params, state.fit),
-            )  # fmt: skip
-            text = f"{loop.what} {trial}/{last}  {records.describe(rows)}"
-            progress.line(f"{text}  {sum(seconds.values()):.1f} s")
-    return trials
+def _spread(say: Say, *counts: int) -> Spread:
+    """Spreads branches over hosts and devices, and says what stays idle."""
+    spread = devices.spread(*counts)
+    if line := devices.idle(spread):
+        say(line)
+    return spread
 
 
 def _explored(config: Config, source: Path, step: int, parts: Parts, say: Say) -> State:
@@ -202,15 +169,9 @@ def _explored(config: Config, source: Path, step: int, parts: Parts, say: Say) -
     keys = trial_keys(config, EXPLORE, 0)
     init = jax.vmap(parts.learner.init, out_axes=LEARNER_AXES)
     template = jax.eval_shape(init, keys)
-    found = checkpoint.restore(
-        source / "checkpoints", template, step=step, warn=_warning(say)
-    )
+    found = loop.restore(source / "checkpoints", template, say, step)
     assert found is not None
     return found[1]
-
-
-def _warning(say: Say) -> Say:
-    return lambda line: say(f"warning: {line}")
 
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:

@@ -9,6 +9,7 @@ from types import FrameType
 
 import tqdm
 
+from experiments import hosts
 from experiments.errors import InterruptedRun
 
 # A log file gets a line per trial, no bar.
@@ -22,30 +23,37 @@ class Progress:
     """A bar over environment steps, lines per trial, and the wish to stop."""
 
     def __init__(self, total: int, done: int, what: str) -> None:
+        self._shown = hosts.is_first()
         self._bar = tqdm.tqdm(
             total=total,
             initial=done,
             desc=what,
             unit=" steps",
             bar_format=_BAR,
-            disable=not sys.stderr.isatty(),
+            disable=not (self._shown and sys.stderr.isatty()),
             dynamic_ncols=True,
             smoothing=0.1,
         )
         self._what = what
         self._start = time.monotonic()
         self._first, self._total, self._done = done, total, done
-        self._stop: str | None = None
+        self._stop = 0
 
     def tick(self, steps: int) -> None:
-        """Counts steps of one environment; raises InterruptedRun after a signal."""
+        """Counts steps of one environment.
+
+        Raises:
+          InterruptedRun: after a signal, on every host if one of them got it.
+        """
         self._done += steps
         self._bar.update(steps)
-        if self._stop is not None:
-            raise InterruptedRun(self._stop)
+        if number := hosts.agree(self._stop):
+            raise InterruptedRun(signal.Signals(number).name)
 
     def line(self, text: str) -> None:
         """Prints a line above the bar, with the time left where no bar shows it."""
+        if not self._shown:
+            return
         if not sys.stderr.isatty():
             elapsed = time.monotonic() - self._start
             rate = (self._done - self._first) / max(elapsed, 1e-9)
@@ -63,7 +71,7 @@ class Progress:
 
         def request(number: int, frame: FrameType | None) -> None:
             del frame
-            self._stop = signal.Signals(number).name
+            self._stop = number
             for name in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(name, signal.SIG_DFL)
 

@@ -4,11 +4,11 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from experiments import cli, session
-from experiments.config import Config
+from experiments import cli, hosts, session
+from experiments.config import PRESETS, Config
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -27,9 +27,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
     try:
-        config = cli.parse(arguments)
-        with _plain_errors(config):
-            _dispatch(config)
+        # The library logs what a user cannot act on.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+        with hosts.joined(cli.place(arguments), _say):
+            plain = hosts.on_first(lambda: cli.to_json(cli.parse(arguments)))
+            config = cli.from_json(plain, PRESETS["smoke"])
+            with _plain_errors(config):
+                _dispatch(config)
     except RunError as error:
         if "--debug" in arguments:
             traceback.print_exc()
@@ -46,38 +50,36 @@ def _dispatch(config: Config) -> None:
         for path in report.write_report(config.out, config.out / "report"):
             _say(f"wrote {path}")
         return
-    # The library logs what a user cannot act on.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     source = cli.explored_run(config)
     if config.phase == "explore":
         _explore(config, source)
         return
-    step = _explored_step(config, source)
+    step = hosts.on_first(lambda: _explored_step(config, source))
     folder = source / f"{config.phase}-{step:03d}"
     if config.task != "all":
         folder = folder.with_name(f"{folder.name}-{config.task}")
-    with (
-        _without_gl(),
-        session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say),
-    ):
+    with _without_gl(), _opened(config, folder):
         from experiments import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
         phase(config, source, folder, step, _say)
-    if config.video is not None:
+    if config.video is not None and hosts.is_first():
         _video(config, folder)
 
 
 def _explore(config: Config, folder: Path) -> None:
     _check_cpu(config)
-    with (
-        _without_gl(),
-        session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say),
-    ):
+    with _without_gl(), _opened(config, folder):
         from experiments import phases
 
         phases.explore(config, folder, _say)
     _say(f"next: python -m experiments.run --phase zero-shot --from {folder}")
+
+
+def _opened(config: Config, folder: Path) -> AbstractContextManager[None]:
+    """Returns what holds a run's folder, on the process that has one."""
+    run = session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say)
+    return hosts.held_by_first(run)
 
 
 def _explored_step(config: Config, source: Path) -> int:
@@ -184,7 +186,8 @@ def _memory_advice(config: Config) -> str:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    if hosts.is_first():
+        print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -46,6 +46,8 @@ def explored(out, name="smoke-epistemic", **changes):
 
 TRIALS = ["--num-trials", "1 to 100,000"]
 ELITES = ["--planner.num-elites", "9", "2 to --planner.num-samples (8)"]
+AT = ("--coordinator-address", "host:1")
+AUTO = (AT[0], "auto")
 RATE = ["--training.learning-rate", "1e-09 to 1.0"]
 
 
@@ -58,6 +60,7 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
         ((*SMOKE, "--preset", "huge"), ["--preset", "huge", "paper, laptop, smoke"]),
         ((*SMOKE, "--preset"), ["--preset", "paper, laptop, smoke"]),
         ((*SMOKE, "--arm", "x"), ["--arm", "'x'", "'one-step'"]),
+        ((*SMOKE, "--engine", "warp"), ["--engine", "'warp'", "'mujoco'"]),
         ((*SMOKE, "--task", "swim"), ["--task", "'swim'", "'back-flip'"]),
         ((*LATER, "--arm", "x"), ["--arm", "'x'", "'one-step'"]),
         ((*SMOKE, "--num-trails", "3"), ["--num-trails", "Perhaps", "--num-trials"]),
@@ -108,6 +111,23 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
             ["--preset paper", "hours", "--allow-cpu"],
         ),
         (("--phase", "report"), ["metrics.jsonl"]),
+        ((*SMOKE, "--num-processes", "2"), ["--num-processes 2", "left out, unless"]),
+        ((*SMOKE, "--process-id", "0"), ["--process-id 0", "left out, unless"]),
+        ((*SMOKE, *AUTO, "--num-processes", "2"), ["--num-processes 2", "left out"]),
+        ((*SMOKE, *AT[:1], "host"), [AT[0], "host is not", "HOST:PORT or auto"]),
+        ((*SMOKE, *AT[:1], ":1"), [AT[0], "HOST:PORT or auto"]),
+        ((*SMOKE, *AT[:1], "h:123456"), [AT[0], "HOST:PORT or auto"]),
+        ((*SMOKE, *AT), ["--num-processes None", "1 or more", AT[0]]),
+        ((*SMOKE, *AT, "--num-processes", "x"), ["--num-processes", "1 to 100,000"]),
+        *[
+            (
+                (*SMOKE, *AT, "--num-processes", "2", *own),
+                [" ".join(own), "0 to", "(2)"],
+            )
+            for own in ((), ("--process-id", "2"), ("--process-id", "-1"))
+        ],
+        ((*SMOKE, *AT, "--num-processes", "0"), ["--num-processes 0", "1 or more"]),
+        (("--phase", "report", *AUTO), ["--coordinator-address auto", "in report"]),
     ],
     ids=str,
 )
