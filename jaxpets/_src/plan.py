@@ -1,12 +1,15 @@
 """The one transform: a rollout, a reward and an optimizer become a planner."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_action_box, check_key
+from jaxpets._src.checks import check_action_box, check_count, check_key
+from jaxpets._src.chunks import chunked
 from jaxpets._src.types import (
     WORST_VALUE,
     Planner,
@@ -19,7 +22,11 @@ from jaxpets._src.types import (
 
 
 def plan(
-    rollout_fn: RolloutFn, reward_fn: RewardFn, optimizer: TrajectoryOptimizer
+    rollout_fn: RolloutFn,
+    reward_fn: RewardFn,
+    optimizer: TrajectoryOptimizer,
+    *,
+    chunk_size: int | None = None,
 ) -> Planner:
     """Builds a model-predictive controller.
 
@@ -32,18 +39,33 @@ def plan(
     `jax.vmap(planner.step, (None, 0, 0, 0))`, over tasks with
     `(PlanParams(None, 0), 0, 0, 0)`, over seeds with `(PlanParams(0, 0), 0, 0, 0)`.
 
+    Memory: a call holds the paths of the candidates in hand, the model's work on one
+    step of them, and the sequences of all candidates. With an ensemble of width W that
+    is about `4 (n E P ((H + 10) D + 2 W) + 7 N H A)` bytes per mapped call, where n is
+    N or `chunk_size`, plus what reward_fn needs for n candidates at all H steps.
+
     Args:
       rollout_fn: imagines; reads `PlanParams.dynamics`.
       reward_fn: rewards one imagined step; reads `PlanParams.reward`.
       optimizer: searches; its state is the planner's state.
+      chunk_size: at most so many candidates are imagined and rewarded at a time; None
+        for all. The plan is the same, candidate for candidate: a chunk gets a key that
+        draws its share of the noise, for which rollout_fn must draw in the shape
+        `[E, B, ...]`, as a DynamicsFn does, or not at all, and the key must be JAX's
+        default kind, partitionable threefry. Chunks follow one another, so take the
+        largest that fits.
 
     Returns:
       A Planner.
 
     Raises:
+      TypeError, ValueError: if chunk_size is no positive Python integer.
       ValueError: from `step`, at trace time, when rollout_fn or reward_fn return a
-        shape that the contract does not allow.
+        shape that the contract does not allow, or chunks are asked of another kind of
+        key; when it is compiled, if the noise cannot be divided.
     """
+    if chunk_size is not None:
+        check_count("chunk_size", chunk_size)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         reward = jnp.asarray(reward_fn(params, obs, action, next_obs))
@@ -56,32 +78,43 @@ def plan(
             )
         return jnp.mean(reward)
 
-    rewards = jax.vmap(reward, (None, 0, 0, 0))  # over time
-    rewards = jax.vmap(rewards, (None, 0, 0, 0))  # over candidates
+    rewards = jax.vmap(reward, (None, 1, 0, 1))  # over candidates
+    rewards = jax.vmap(rewards, (None, 0, 0, 0))  # over time
 
     def step(
         params: PlanParams, key: Array, state: Any, obs: Any
     ) -> tuple[PlanOutput, Any]:
         check_key("key", key)
+        imagine = _bound(rollout_fn, params.dynamics)
 
         def objective(key: Array, actions: Array) -> Array:
-            path = rollout_fn(params.dynamics, key, obs, actions)
+            path = imagine(key, obs, actions)
             num_samples, horizon, _ = actions.shape
             if path.ndim != 5 or path.shape[:2] != (num_samples, horizon + 1):
                 raise ValueError(
                     "rollout_fn must return shape "
                     f"({num_samples}, {horizon + 1}, E, P, D), got {path.shape}."
                 )
-            value = rewards(params.reward, path[:, :-1], actions, path[:, 1:]).sum(1)
+            # In the order of time, in which it was imagined, no part of it is copied.
+            path = path.transpose(1, 2, 0, 3, 4)
+            steps = (path[:-1], actions.swapaxes(0, 1), path[1:])
+            value = rewards(params.reward, *steps).sum(0)
             finite = jnp.isfinite(value)
             return jnp.where(
                 finite, jnp.clip(value, WORST_VALUE, -WORST_VALUE), WORST_VALUE
             )
 
-        solution, state = optimizer.step(objective, key, state)
+        whole = objective if chunk_size is None else chunked(objective, chunk_size)
+        solution, state = optimizer.step(whole, key, state)
         return PlanOutput(solution.actions[0], solution.actions, solution.value), state
 
     return Planner(optimizer.init, step)
+
+
+def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], Array]:
+    """Binds the model, before the loop of the search: XLA would not move it out."""
+    bind = getattr(rollout_fn, "bind", None)
+    return bind(params) if bind else functools.partial(rollout_fn, params)
 
 
 def random_planner(action_low: Array, action_high: Array) -> Planner:

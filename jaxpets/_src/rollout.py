@@ -58,8 +58,9 @@ def particle_rollout(
 
         keys = jax.random.split(key, horizon)
         _, path = jax.lax.scan(step, start, (keys, row_actions))
-        path = jnp.concatenate([start[None], path])
-        path = path.reshape(horizon + 1, num_members, num_samples, per_member, -1)
+        path = path.reshape(horizon, num_members, num_samples, per_member, -1)
+        path = jnp.concatenate([jnp.broadcast_to(obs, (1, *path.shape[1:])), path])
+        # Last, so that it cancels where a planner undoes it: the path is never copied.
         return path.transpose(2, 0, 1, 3, 4)
 
     return rollout

@@ -87,7 +87,11 @@ class DynamicsFn(Protocol):
 
 
 class RolloutFn(Protocol):
-    """An imagination: action sequences in, observation paths out."""
+    """An imagination: action sequences in, observation paths out.
+
+    It may have a method `bind(params)` that returns `(key, obs, actions) -> path`. Then
+    a planner binds once, before its search, what depends on nothing but the model.
+    """
 
     def __call__(self, params: Any, key: Array, obs: Any, actions: Array, /) -> Array:
         """Rolls N action sequences out from one start.
