@@ -13,11 +13,13 @@ from jaxpets._src.ensemble import (
     max_variance,
 )
 from jaxpets._src.fit import FitConfig, FitMetrics, FitState, Fitter, fit
+from jaxpets._src.fused_rollout import fused_rollout
 from jaxpets._src.icem import ICEMState, colored_noise, icem
 from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput, learner
 from jaxpets._src.mppi import MPPIState, mppi
 from jaxpets._src.plan import plan, random_planner
 from jaxpets._src.rollout import particle_rollout
+from jaxpets._src.sharded import sharded
 from jaxpets._src.types import (
     WORST_VALUE,
     Dataset,
@@ -78,6 +80,7 @@ __all__ = [
     "delta_space",
     "ensemble",
     "fit",
+    "fused_rollout",
     "grow",
     "icem",
     "init_dataset",
@@ -88,6 +91,7 @@ __all__ = [
     "plan",
     "random_planner",
     "rewards",
+    "sharded",
     "start",
     "unroll",
 ]

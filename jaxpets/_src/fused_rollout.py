@@ -1,23 +1,26 @@
 """Trajectory sampling as one GPU kernel: all steps of all particles in one launch."""
 
+import dataclasses
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.checks import check_array
+from jaxpets._src.chunks import WINDOW
 from jaxpets._src.ensemble import (
     EnsembleConfig,
     EnsembleParams,
-    Precision,
     ensemble,
     imagined_range,
 )
 from jaxpets._src.kernel.build import BuildError, load_kernel
 from jaxpets._src.kernel.row_code import UnsupportedError, row_function
 from jaxpets._src.kernel.shape import KernelShape
+from jaxpets._src.network import Precision
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import ModelSpace, RolloutFn
 
@@ -35,8 +38,9 @@ def fused_rollout(
 
     It computes what `particle_rollout(ensemble(config, space, ...).sample, ...)` does,
     with the same noise for the same key. Products read float16 and add up in float32:
-    closer to float32 than the scan in bfloat16. Where there can be no kernel the scan
-    runs, and a warning of one line says why:
+    closer to float32 than the scan in bfloat16, but an input of the network, or of one of
+    its layers, beyond 65504 is infinite and leads to NaN, which a planner counts as the
+    worst. Where there can be no kernel the scan runs, and a warning of one line says why:
 
     - `config.precision` is not BF16, the only precision the kernel has;
     - the first device is no GPU of compute capability 9.0 (H100, H200, GH200);
@@ -68,7 +72,6 @@ def fused_rollout(
     scan = particle_rollout(
         model.sample, num_members=config.num_members, num_particles=num_particles
     )
-    check_count("num_particles", num_particles)
     feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
     shape = KernelShape(obs_size, action_size, feature_size, config.hidden_sizes)
     try:
@@ -76,32 +79,40 @@ def fused_rollout(
     except (BuildError, UnsupportedError) as error:
         warnings.warn(f"fused_rollout runs as a scan: {error}.", stacklevel=2)
         return scan
-    per_member = num_particles // config.num_members
 
-    def rollout(
-        params: EnsembleParams, key: Array, obs: Array, actions: Array
-    ) -> Array:
-        check_array("obs", obs, [obs_size])
-        check_array("actions", actions, ["N", "H", action_size])
-        if not _is_counted(key):
-            warnings.warn(
-                "fused_rollout runs as a scan: keys are not partitionable threefry.",
-                stacklevel=2,
-            )
-            return scan(params, key, obs, actions)
-        num_samples, horizon, _ = actions.shape
+    def bind(params: EnsembleParams) -> Callable[[Array, Array, Array], Array]:
         layers = params.network.members["params"]
-        names = [f"layer_{i}" for i in range(len(layers))]
-        weights = shape.pack([layers[name] for name in names])
-        path = jax.ShapeDtypeStruct(
-            (num_samples, horizon + 1, config.num_members, per_member, obs_size),
-            jnp.float32,
-        )
-        call = jax.ffi.ffi_call(target, path, vmap_method="expand_dims")
-        keys = jax.random.key_data(jax.random.split(key, horizon))
-        return call(weights, _shared(config, params), keys, obs, actions)
+        weights = shape.pack([layers[f"layer_{i}"] for i in range(len(layers))])
+        shared = _shared(config, params)
 
-    return rollout
+        def rollout(key: Array, obs: Array, actions: Array) -> Array:
+            check_array("obs", obs, [obs_size])
+            check_array("actions", actions, ["N", "H", action_size])
+            if not _is_counted(key):
+                problem = "keys are not partitionable threefry"
+                warnings.warn(f"fused_rollout runs as a scan: {problem}.", stacklevel=2)
+                return scan(params, key, obs, actions)
+            # The scan knows what params must be; the kernel would read past their end.
+            path = jax.eval_shape(scan, params, key, obs, actions)
+            num_samples, horizon, _ = actions.shape
+            call = jax.ffi.ffi_call(target, path, vmap_method="expand_dims")
+            return call(weights, shared, _keys(key, horizon, num_samples), obs, actions)
+
+        return rollout
+
+    return _FusedRollout(bind)
+
+
+@dataclasses.dataclass(frozen=True)
+class _FusedRollout:
+    """A RolloutFn; `bind` lays the weights out for the kernel, once for many calls."""
+
+    bind: Callable[[EnsembleParams], Callable[[Array, Array, Array], Array]]
+
+    def __call__(
+        self, params: EnsembleParams, key: Array, obs: Array, actions: Array
+    ) -> Array:
+        return self.bind(params)(key, obs, actions)
 
 
 def _target(
@@ -115,10 +126,11 @@ def _target(
     if not interpret:
         _check_device(jax.devices()[0])
     rows = {name: shape.obs_size for name in ("obs", "target", "low", "high")}
+    is_free = config.state_margin is None
     functions = {
         "features": (space.features, ("obs",)),
         "next_obs": (space.next_obs, ("obs", "target")),
-        "bound": (space.bound, ("obs", "low", "high")),
+        "bound": (_free if is_free else space.bound, ("obs", "low", "high")),
     }
     code = [
         row_function(name, function, [(row, rows[row]) for row in arguments])
@@ -127,6 +139,11 @@ def _target(
     products = [] if interpret else [shape.products()]
     model = ['#pragma once\n#include "row.h"', shape.header(), *code, *products]
     return load_kernel("\n".join(model), cuda=not interpret)
+
+
+def _free(obs: Array, low: Array, high: Array) -> Array:
+    del low, high
+    return obs
 
 
 def _check_device(device: Any) -> None:
@@ -139,8 +156,17 @@ def _check_device(device: Any) -> None:
 
 def _is_counted(key: Array) -> bool:
     """Whether element i of a draw depends on the key and i alone, as in the kernel."""
-    is_threefry = jax.random.key_impl(key) == "threefry2x32"
+    is_threefry = str(jax.random.key_impl(key)) in ("threefry2x32", WINDOW)
     return is_threefry and bool(jax.config.jax_threefry_partitionable)  # pyright: ignore
+
+
+def _keys(key: Array, horizon: int, num_samples: int) -> Array:
+    """Returns the keys of the steps and which candidates to draw for, `[H, 4]`."""
+    data = jax.random.key_data(jax.random.split(key, horizon))
+    if data.shape[-1] == 4:
+        return data  # a window of more candidates
+    all_here = jnp.array([0, num_samples], jnp.uint32)
+    return jnp.concatenate([data, jnp.broadcast_to(all_here, data.shape)], axis=-1)
 
 
 def _shared(config: EnsembleConfig, params: EnsembleParams) -> Array:
@@ -149,4 +175,4 @@ def _shared(config: EnsembleConfig, params: EnsembleParams) -> Array:
     low, high = imagined_range(config, scaler)
     parts = [scaler.mean, 1.0 / scaler.std, low, high]
     parts += [jnp.exp(network.min_logvar), jnp.exp(-network.max_logvar)]
-    return jnp.concatenate(parts)
+    return jnp.concatenate([jnp.pad(part, (0, -part.size % 4)) for part in parts])

@@ -42,8 +42,12 @@ def load_kernel(model: str, *, cuda: bool) -> str:
     digest = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:16]
     target = f"{_SYMBOL}_{'cuda' if cuda else 'cpu'}_{digest}"
     library = _cache_folder() / f"{target}.so"
-    if not library.exists():
-        _compile(compiler, sources, "rollout.cu" if cuda else "reference.cc", library)
+    main = "rollout.cu" if cuda else "reference.cc"
+    try:
+        if not library.exists():
+            _compile(compiler, sources, main, library)
+    except OSError as error:
+        raise BuildError(f"cannot write to the cache folder: {error}") from error
     try:
         handler = getattr(ctypes.CDLL(str(library)), _SYMBOL)
     except OSError as error:

@@ -47,11 +47,14 @@ Problem read(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer keys,
   rollout.num_members = dims[axes + 2];
   rollout.particles = dims[axes + 3];
   if (dims[axes + 4] != OBS ||
+      weights.dimensions()[axes] != rollout.num_members ||
       weights.dimensions()[axes + 1] != MEMBER_WEIGHTS ||
-      shared.dimensions()[axes] != SHARED_NUMBERS)
+      shared.dimensions()[axes] != SHARED_NUMBERS || keys.dimensions()[axes + 1] != KEY)
     return {rollout, "the operands are those of another model"};
-  if (product(dims, axes, dims.size()) > INT32_MAX)
-    return {rollout, "a path has more than 2^31 numbers"};
+  const auto action_dims = actions.dimensions();
+  if (product(dims, axes, dims.size()) > INT32_MAX ||
+      product(action_dims, axes, action_dims.size()) > INT32_MAX)
+    return {rollout, "a path has more than 2^31 numbers; plan in chunks"};
   rollout.batch = product(dims, 0, axes);
   for (int axis = 0; axis < MAX_BATCH_AXES; ++axis) {
     BatchAxis& out = rollout.axes[axis];

@@ -27,6 +27,15 @@ std::vector<float> multiply(const std::vector<Half>& inputs, const Half* weights
   return sums;
 }
 
+// A hidden layer's products: all chunks of its left columns, then those of the right.
+std::vector<float> multiply_halves(const std::vector<Half>& inputs, const Half* weights) {
+  std::vector<float> sums = multiply(inputs, weights, LEFT);
+  const std::vector<float> right =
+      multiply(inputs, weights + inputs.size() * LEFT, RIGHT);
+  sums.insert(sums.end(), right.begin(), right.end());
+  return sums;
+}
+
 std::vector<Half> activate(const std::vector<float>& sums) {
   std::vector<Half> activations(HIDDEN_CHUNKS * DEPTH, Half(0));
   for (int i = 0; i < WIDTH; ++i)
@@ -36,7 +45,6 @@ std::vector<Half> activate(const std::vector<float>& sums) {
 }
 
 void run_particle(const Rollout& rollout, int member, int particle) {
-  const int rows = rollout.num_candidates * rollout.particles;
   const int candidate = particle / rollout.particles;
   const int64_t stride = int64_t(rollout.num_members) * rollout.particles * OBS;
   float* path = rollout.path + candidate * (rollout.horizon + 1) * stride +
@@ -55,20 +63,21 @@ void run_particle(const Rollout& rollout, int member, int particle) {
       inputs[i] = Half(
           scaled(i < FEATURES ? values[i] : actions[i - FEATURES], i, rollout.shared));
     inputs[INPUTS] = inputs[INPUTS + 1] = Half(1);
-    std::vector<Half> activations = activate(multiply(inputs, weights, WIDTH));
+    std::vector<Half> activations = activate(multiply_halves(inputs, weights));
     weights += INPUT_WEIGHTS;
     for (int layer = 1; layer < LAYERS; ++layer, weights += HIDDEN_WEIGHTS)
-      activations = activate(multiply(activations, weights, WIDTH));
+      activations = activate(multiply_halves(activations, weights));
     const std::vector<float> head = multiply(activations, weights, 2 * HEAD);
     float target[OBS];
-    for (int i = 0; i < OBS; ++i) {
-      const uint32_t counter = (uint32_t(member) * rows + particle) * OBS + i;
-      const float noise = normal(threefry_bits(rollout.keys[2 * step],
-                                               rollout.keys[2 * step + 1], counter));
-      target[i] = head[i] + noise * deviation(head[HEAD + i],
-                                              rollout.shared[MIN_VARIANCE + i],
-                                              rollout.shared[MAX_PRECISION + i]);
-    }
+    const uint32_t* key = rollout.keys + KEY * step;
+    uint32_t bits[OBS];
+    float noise[OBS];
+    threefry(key[0], key[1], noise_counter(rollout, key, member, particle), 1, bits);
+    normal(bits, noise);
+    for (int i = 0; i < OBS; ++i)
+      target[i] = head[i] + noise[i] * deviation(head[HEAD + i],
+                                                 rollout.shared[MIN_VARIANCE + i],
+                                                 rollout.shared[MAX_PRECISION + i]);
     move(obs, target, rollout.shared);
     for (int i = 0; i < OBS; ++i) path[(step + 1) * stride + i] = obs[i];
   }

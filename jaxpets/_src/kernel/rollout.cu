@@ -12,9 +12,6 @@
 // state and its update are float32.
 
 #include <cuda_fp16.h>
-#ifdef WATCHDOG
-#include <cstdio>
-#endif
 
 #include "handler.h"
 #include "rollout.h"
@@ -28,31 +25,27 @@ constexpr int CONSUMERS = 2;
 constexpr int THREADS = (CONSUMERS + 1) * WARPGROUP;
 constexpr int NOISE_WARPS = 3;
 
-constexpr int TARGET_STRIDE = OBS | 1;  // odd: a thread a row without bank conflicts
+// An odd number of 16 byte words: a thread a row, four numbers at once, and no conflicts.
+constexpr int STATE_STRIDE = 4 * (round_up(OBS, 4) / 4 | 1);
 constexpr int INPUT_STRIDE = INPUT_CHUNKS * DEPTH + 8;
-constexpr int SLOT = HIDDEN_CHUNK > OUTPUT_CHUNK ? HIDDEN_CHUNK : OUTPUT_CHUNK;
+constexpr int SLOT = UNIT * DEPTH * LEFT;  // LEFT >= RIGHT
 
-// Which chunks of a layer stream: `streamed` of `chunks`, spread evenly.
-__host__ __device__ constexpr bool streams(int chunk, int chunks, int streamed) {
-  return (chunk + 1) * streamed / chunks > chunk * streamed / chunks;
-}
-__host__ __device__ constexpr int residents_before(int chunk, int chunks, int streamed) {
-  return chunk - chunk * streamed / chunks;
-}
-
-constexpr int RESIDENT_INPUT = INPUT_CHUNKS - INPUT_STREAMED;
-constexpr int RESIDENT_HIDDEN = HIDDEN_CHUNKS - HIDDEN_STREAMED;
-constexpr int RESIDENT_OUTPUT = HIDDEN_CHUNKS - OUTPUT_STREAMED;
+// Numbers of a layer that stay in shared memory.
+constexpr int RESIDENT_INPUT = INPUT_WEIGHTS;
+constexpr int RESIDENT_HIDDEN = (HIDDEN_CHUNKS - LEFT_STREAMED) * DEPTH * LEFT +
+                                (HIDDEN_CHUNKS - RIGHT_STREAMED) * DEPTH * RIGHT;
+constexpr int RESIDENT_OUTPUT = OUTPUT_WEIGHTS;
 constexpr int RESIDENT_WEIGHTS =
-    (RESIDENT_INPUT + (LAYERS - 1) * RESIDENT_HIDDEN) * HIDDEN_CHUNK +
-    RESIDENT_OUTPUT * OUTPUT_CHUNK;
+    RESIDENT_INPUT + (LAYERS - 1) * RESIDENT_HIDDEN + RESIDENT_OUTPUT;
 
 struct alignas(128) Shared {
   __half resident[RESIDENT_WEIGHTS > 0 ? RESIDENT_WEIGHTS : 8];
   __half ring[SLOTS][SLOT];
-  float shared[round_up(SHARED_NUMBERS, 4)];
-  float target[CONSUMERS][TILE * TARGET_STRIDE];  // noise, then what the model predicts
-  __half inputs[CONSUMERS][TILE * INPUT_STRIDE];
+  alignas(16) float shared[SHARED_NUMBERS];
+  float state[CONSUMERS][TILE * STATE_STRIDE];
+  float target[CONSUMERS][TILE * STATE_STRIDE];  // noise, then what the model predicts
+  alignas(16) __half inputs[CONSUMERS][TILE * INPUT_STRIDE];
+  int path_offset[CONSUMERS][TILE], action_offset[CONSUMERS][TILE];  // of each row
   uint64_t resident_full, ring_full[SLOTS], ring_empty[SLOTS];
   uint64_t noise_full[CONSUMERS], noise_empty[CONSUMERS];
 };
@@ -80,9 +73,6 @@ __device__ __forceinline__ void expect(uint64_t* barrier, uint32_t bytes) {
 
 __device__ __forceinline__ void wait(uint64_t* barrier, uint32_t parity) {
   uint32_t done = 0;
-#ifdef WATCHDOG
-  int spins = 0;
-#endif
   while (!done) {
     asm volatile(
         "{\n.reg .pred done;\n"
@@ -91,9 +81,6 @@ __device__ __forceinline__ void wait(uint64_t* barrier, uint32_t parity) {
         : "=r"(done)
         : "r"(address(barrier)), "r"(parity)
         : "memory");
-#ifdef WATCHDOG
-    if (++spins > (1 << 22)) { printf("stuck block %d,%d thread %d barrier %d parity %d\n", blockIdx.x, blockIdx.y, threadIdx.x, (int)(address(barrier)), parity); __trap(); }
-#endif
   }
 }
 
@@ -115,14 +102,6 @@ __device__ __forceinline__ uint32_t pack(float low, float high) {
   return *reinterpret_cast<const uint32_t*>(&pair);
 }
 
-// swish(2 h) = h + h tanh(h) of a pair. The weights are halved when they are packed.
-__device__ __forceinline__ uint32_t swish(float low, float high) {
-  float tanh_low, tanh_high;
-  asm("tanh.approx.f32 %0, %1;" : "=f"(tanh_low) : "f"(low));
-  asm("tanh.approx.f32 %0, %1;" : "=f"(tanh_high) : "f"(high));
-  return pack(fmaf(low, tanh_low, low), fmaf(high, tanh_high, high));
-}
-
 // A position in the ring: which slot, and how often the ring has been around.
 struct Cursor {
   int slot = 0;
@@ -132,136 +111,199 @@ struct Cursor {
   }
 };
 
-// Feeds the chunks of one layer that stream.
-template <int CHUNKS, int STREAMED>
-__device__ __forceinline__ void feed(Shared& smem, Cursor& cursor, const uint16_t* weights,
-                                     int size) {
-  for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-    if (!streams(chunk, CHUNKS, STREAMED)) continue;
+// Feeds what streams of a layer, or half of one: its last chunks, a unit at a time.
+template <int CHUNKS, int COLUMNS, int STREAMED>
+__device__ __forceinline__ void feed(Shared& smem, Cursor& cursor,
+                                     const uint16_t* weights) {
+  constexpr int CHUNK = DEPTH * COLUMNS;
+  for (int chunk = CHUNKS - STREAMED; chunk < CHUNKS; chunk += UNIT) {
     wait(&smem.ring_empty[cursor.slot], cursor.round ^ 1);
-    expect(&smem.ring_full[cursor.slot], size * 2);
-    copy(smem.ring[cursor.slot], weights + chunk * size, size * 2,
+    expect(&smem.ring_full[cursor.slot], UNIT * CHUNK * 2);
+    copy(smem.ring[cursor.slot], weights + chunk * CHUNK, UNIT * CHUNK * 2,
          &smem.ring_full[cursor.slot]);
     cursor.advance();
   }
 }
 
-template <int CHUNKS, int STREAMED>
+// Loads what stays, and returns where the next goes.
+template <int CHUNKS, int COLUMNS, int STREAMED>
 __device__ __forceinline__ __half* load_residents(Shared& smem, __half* to,
-                                                  const uint16_t* weights, int size) {
-  for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-    if (streams(chunk, CHUNKS, STREAMED)) continue;
-    copy(to, weights + chunk * size, size * 2, &smem.resident_full);
-    to += size;
-  }
-  return to;
+                                                  const uint16_t* weights) {
+  constexpr int SIZE = (CHUNKS - STREAMED) * DEPTH * COLUMNS;
+  if (SIZE > 0) copy(to, weights, SIZE * 2, &smem.resident_full);
+  return to + SIZE;
 }
 
 __device__ void feed_weights(Shared& smem, const uint16_t* weights, int horizon) {
+  constexpr int LEFT_WEIGHTS = HIDDEN_CHUNKS * DEPTH * LEFT;
+  constexpr int INPUT_LEFT = INPUT_CHUNKS * DEPTH * LEFT;
   const uint16_t* hidden = weights + INPUT_WEIGHTS;
   const uint16_t* output = hidden + (LAYERS - 1) * HIDDEN_WEIGHTS;
-  expect(&smem.resident_full, RESIDENT_WEIGHTS * 2);
   __half* to = smem.resident;
-  to = load_residents<INPUT_CHUNKS, INPUT_STREAMED>(smem, to, weights, HIDDEN_CHUNK);
-  for (int layer = 0; layer < LAYERS - 1; ++layer)
-    to = load_residents<HIDDEN_CHUNKS, HIDDEN_STREAMED>(
-        smem, to, hidden + layer * HIDDEN_WEIGHTS, HIDDEN_CHUNK);
-  load_residents<HIDDEN_CHUNKS, OUTPUT_STREAMED>(smem, to, output, OUTPUT_CHUNK);
+  expect(&smem.resident_full, RESIDENT_WEIGHTS * 2);
+  to = load_residents<INPUT_CHUNKS, LEFT, 0>(smem, to, weights);
+  to = load_residents<INPUT_CHUNKS, RIGHT, 0>(smem, to, weights + INPUT_LEFT);
+  for (int layer = 0; layer < LAYERS - 1; ++layer) {
+    const uint16_t* from = hidden + layer * HIDDEN_WEIGHTS;
+    to = load_residents<HIDDEN_CHUNKS, LEFT, LEFT_STREAMED>(smem, to, from);
+    to = load_residents<HIDDEN_CHUNKS, RIGHT, RIGHT_STREAMED>(smem, to,
+                                                              from + LEFT_WEIGHTS);
+  }
+  load_residents<HIDDEN_CHUNKS, 2 * HEAD, 0>(smem, to, output);
   Cursor cursor;
   for (int step = 0; step < horizon; ++step) {
-    feed<INPUT_CHUNKS, INPUT_STREAMED>(smem, cursor, weights, HIDDEN_CHUNK);
-    for (int layer = 0; layer < LAYERS - 1; ++layer)
-      feed<HIDDEN_CHUNKS, HIDDEN_STREAMED>(
-          smem, cursor, hidden + layer * HIDDEN_WEIGHTS, HIDDEN_CHUNK);
-    feed<HIDDEN_CHUNKS, OUTPUT_STREAMED>(smem, cursor, output, OUTPUT_CHUNK);
+    for (int layer = 0; layer < LAYERS - 1; ++layer) {
+      const uint16_t* from = hidden + layer * HIDDEN_WEIGHTS;
+      feed<HIDDEN_CHUNKS, LEFT, LEFT_STREAMED>(smem, cursor, from);
+      feed<HIDDEN_CHUNKS, RIGHT, RIGHT_STREAMED>(smem, cursor, from + LEFT_WEIGHTS);
+    }
   }
 }
 
-// Draws the noise of `jax.random.normal(key of the step, [E, B, OBS])`.
+// Draws the noise of `jax.random.normal(key of the step, [E, N, P, OBS])`.
 __device__ void draw_noise(Shared& smem, const Rollout& rollout, int member,
                            int first_row, int thread) {
-  const int rows = rollout.num_candidates * rollout.particles;
-  constexpr int STRIDE = NOISE_WARPS * 32, PER_TILE = TILE * OBS, UNROLL = 4;
+  constexpr int STRIDE = NOISE_WARPS * 32, PER_TILE = TILE * OBS, AT_ONCE = 6;
+  constexpr bool EXACT = PER_TILE % (STRIDE * AT_ONCE) == 0;
   for (int step = 0; step < rollout.horizon; ++step) {
-    const uint32_t key0 = rollout.keys[2 * step], key1 = rollout.keys[2 * step + 1];
+    const uint32_t* key = rollout.keys + KEY * step;
+    const uint32_t key0 = key[0], key1 = key[1];
+    uint32_t counter = noise_counter(rollout, key, member, first_row) + thread;
     for (int consumer = 0; consumer < CONSUMERS; ++consumer) {
-      const uint32_t first =
-          (uint32_t(member) * rows + first_row + consumer * TILE) * OBS;
       wait(&smem.noise_empty[consumer], (step & 1) ^ 1);
-      for (int i = thread; i < PER_TILE; i += STRIDE * UNROLL) {
-        uint32_t bits[UNROLL];
+      for (int i = thread; i < PER_TILE; i += STRIDE * AT_ONCE) {
+        uint32_t bits[AT_ONCE];
+        float drawn[AT_ONCE];
+        threefry(key0, key1, counter + (i - thread), STRIDE, bits);
+        normal(bits, drawn);
+        const int column = i % OBS;
+        float* const place = smem.target[consumer] + i / OBS * STATE_STRIDE + column;
 #pragma unroll
-        for (int k = 0; k < UNROLL; ++k)
-          bits[k] = threefry_bits(key0, key1, first + i + k * STRIDE);
-#pragma unroll
-        for (int k = 0; k < UNROLL; ++k) {
-          const int at = i + k * STRIDE;
-          if (at < PER_TILE)
-            smem.target[consumer][at / OBS * TARGET_STRIDE + at % OBS] = normal(bits[k]);
+        for (int k = 0; k < AT_ONCE; ++k) {
+          const int rows = k * STRIDE / OBS, columns = k * STRIDE % OBS;
+          const int carry = column + columns >= OBS ? STATE_STRIDE - OBS : 0;
+          if (EXACT || i + k * STRIDE < PER_TILE)
+            place[rows * STATE_STRIDE + columns + carry] = drawn[k];
         }
       }
+      counter += PER_TILE;
       __syncwarp();
       if (thread % 32 == 0) arrive(&smem.noise_full[consumer]);
     }
   }
 }
 
-// One layer's products: accumulators = activations x weights.
+__device__ __forceinline__ void release(Shared& smem, int slot) {
+  if (threadIdx.x % 32 == 0) arrive(&smem.ring_empty[slot]);
+}
+
+// Starts sums = activations x weights, as groups of products in flight. A slot of the
+// ring is handed back when the unit after it has been started; returns the last slot,
+// which the caller hands back, if any chunk streams.
 template <int CHUNKS, int COLUMNS, int STREAMED, int REGISTERS>
-__device__ __forceinline__ void multiply(float (&sums)[COLUMNS / 2],
-                                         const uint32_t (&activations)[REGISTERS],
-                                         const __half* resident, Shared& smem,
-                                         Cursor& cursor) {
-  constexpr int CHUNK = DEPTH * COLUMNS;
-  int pending = -1;  // a slot that is still being read
-  const uint64_t descriptor = weight_descriptor(address(resident));
-  const bool leader = threadIdx.x % 32 == 0;
+__device__ __forceinline__ int multiply(float (&sums)[COLUMNS / 2],
+                                        const uint32_t (&activations)[REGISTERS],
+                                        const __half* resident, Shared& smem,
+                                        Cursor& cursor) {
+  constexpr int RESIDENT = CHUNKS - STREAMED;
+  constexpr int CHUNK_STRIDE = DEPTH * COLUMNS * 2 / 16;  // in units of descriptors
+  uint64_t weights = weight_descriptor(address(resident));
+  int pending = -1;
   wgmma_fence();
 #pragma unroll
   for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-    uint64_t weights;
-    int slot = -1;
-    if (streams(chunk, CHUNKS, STREAMED)) {
-      slot = cursor.slot;
-      wait(&smem.ring_full[slot], cursor.round);
-      weights = weight_descriptor(address(smem.ring[slot]));
+    const bool streamed = chunk >= RESIDENT;
+    const int in_unit = (chunk - RESIDENT) % UNIT;
+    if (streamed && in_unit == 0) {
+      wait(&smem.ring_full[cursor.slot], cursor.round);
+      weights = weight_descriptor(address(smem.ring[cursor.slot]));
+      wgmma_fence();  // or nvcc 13.0, after the branch, lets no two products run at once
+    }
+    const uint32_t* a = activations + 4 * chunk;
+    Wgmma<COLUMNS>::multiply(sums, a[0], a[1], a[2], a[3],
+                             weights + (streamed ? in_unit : chunk) * CHUNK_STRIDE,
+                             chunk > 0);
+    if (chunk + 1 == RESIDENT) wgmma_commit();
+    if (streamed && in_unit + 1 == UNIT) {
+      wgmma_commit();
+      if (chunk >= RESIDENT + UNIT) {
+        wgmma_wait<1>();
+        release(smem, pending);
+      }
+      pending = cursor.slot;
       cursor.advance();
-    } else {
-      weights =
-          descriptor + residents_before(chunk, CHUNKS, STREAMED) * (CHUNK * 2 / 16);
     }
-    Wgmma<COLUMNS>::multiply(sums, activations[4 * chunk], activations[4 * chunk + 1],
-                             activations[4 * chunk + 2], activations[4 * chunk + 3],
-                             weights, chunk > 0);
-    wgmma_commit();
-    if (chunk > 0 && streams(chunk - 1, CHUNKS, STREAMED)) {
-      wgmma_wait<1>();
-      if (leader) arrive(&smem.ring_empty[pending]);
-    }
-    pending = slot;
   }
-  wgmma_wait<0>();
-  if (streams(CHUNKS - 1, CHUNKS, STREAMED) && leader)
-    arrive(&smem.ring_empty[pending]);
-#pragma unroll
-  for (int i = 0; i < COLUMNS / 2; ++i) asm volatile("" : "+f"(sums[i])::"memory");
+  return pending;
 }
 
-// Accumulators become activations, which lie alike in registers. Behind the last
-// activation stand two ones, for the rows of the weights that hold the biases.
-__device__ __forceinline__ void activate(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
-                                         const float (&sums)[WIDTH / 2], int pair) {
+// Waits for all but the last IN_FLIGHT groups of products.
+template <int IN_FLIGHT, int REGISTERS>
+__device__ __forceinline__ void finish(float (&sums)[REGISTERS]) {
+  wgmma_wait<IN_FLIGHT>();
 #pragma unroll
-  for (int block = 0; block < 2 * HIDDEN_CHUNKS; ++block) {
-    uint32_t* pairs = activations + 2 * block;
-    if (8 * block < WIDTH) {
-      const float* sum = sums + 4 * block;
-      pairs[0] = swish(sum[0], sum[1]);
-      pairs[1] = swish(sum[2], sum[3]);
-    } else {
-      pairs[0] = pairs[1] = 8 * block == WIDTH && pair == 0 ? pack(1.0f, 1.0f) : 0;
-    }
+  for (int i = 0; i < REGISTERS; ++i) asm volatile("" : "+f"(sums[i])::"memory");
+}
+
+// swish(2 h) = h + h tanh(h). The weights are halved when they are packed.
+template <int REGISTERS>
+__device__ __forceinline__ void swish(float (&sums)[REGISTERS]) {
+#pragma unroll
+  for (int i = 0; i < REGISTERS; ++i) {
+    float tanh;
+    asm("tanh.approx.f32 %0, %1;" : "=f"(tanh) : "f"(sums[i]));
+    sums[i] = fmaf(sums[i], tanh, sums[i]);
   }
+}
+
+// Nothing that stands before is moved behind. The compiler knows of no time that products
+// take: left alone it first waits for them, and then does what could have been done.
+__device__ __forceinline__ void keep_order() { asm volatile("pmevent 0;" ::: "memory"); }
+
+// The consumers take turns at the tensor cores. Those that shared them would also finish
+// together, and leave them idle together.
+__device__ __forceinline__ void begin_turn(int consumer) {
+  asm volatile("bar.sync %0, 256;" ::"r"(CONSUMERS + 1 + consumer) : "memory");
+}
+
+__device__ __forceinline__ void pass_turn(int consumer) {
+  asm volatile("bar.arrive %0, 256;" ::"r"(2 * CONSUMERS - consumer) : "memory");
+}
+
+// One hidden layer. While the right half of its products runs, the left half goes
+// through swish.
+template <int CHUNKS, int LEFT_STREAMED, int RIGHT_STREAMED, int REGISTERS>
+__device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
+                                             const uint32_t (&operand)[REGISTERS],
+                                             const __half* resident, Shared& smem,
+                                             Cursor& cursor, int pair, int consumer) {
+  constexpr int RESIDENT_LEFT = (CHUNKS - LEFT_STREAMED) * DEPTH * LEFT;
+  float left[LEFT / 2], right[RIGHT / 2];
+  begin_turn(consumer);
+  const int left_slot =
+      multiply<CHUNKS, LEFT, LEFT_STREAMED>(left, operand, resident, smem, cursor);
+  const int right_slot = multiply<CHUNKS, RIGHT, RIGHT_STREAMED>(
+      right, operand, resident + RESIDENT_LEFT, smem, cursor);
+  pass_turn(consumer);
+  finish<1>(left);
+  if (LEFT_STREAMED > 0) release(smem, left_slot);
+  swish(left);
+  keep_order();
+  finish<0>(right);
+  if (RIGHT_STREAMED > 0) release(smem, right_slot);
+  swish(right);
+  // Sums lie in registers as activations do. Rounding waits until here, since no register
+  // that a product reads may be written while another product runs.
+#pragma unroll
+  for (int i = 0; i < LEFT / 4; ++i)
+    activations[i] = pack(left[2 * i], left[2 * i + 1]);
+#pragma unroll
+  for (int i = 0; i < RIGHT / 4; ++i)
+    activations[LEFT / 4 + i] = pack(right[2 * i], right[2 * i + 1]);
+  // Behind the last activation stand two ones, for the rows that hold the biases.
+#pragma unroll
+  for (int i = WIDTH / 4; i < 4 * HIDDEN_CHUNKS; ++i)
+    activations[i] = i < WIDTH / 4 + 2 && pair == 0 ? pack(1.0f, 1.0f) : 0;
 }
 
 // Writes the features of one particle into the input tile.
@@ -270,139 +312,188 @@ __device__ __forceinline__ void write_features(__half* inputs, const float (&obs
   float values[FEATURES];
   features(obs, values);
 #pragma unroll
-  for (int i = 0; i < FEATURES; ++i)
-    inputs[i] = __float2half_rn(scaled(values[i], i, shared));
+  for (int i = 0; i < FEATURES; ++i) values[i] = scaled(values[i], i, shared);
+  uint32_t words[FEATURES / 2 + 1];
+#pragma unroll
+  for (int i = 0; i < FEATURES / 2; ++i)
+    words[i] = pack(values[2 * i], values[2 * i + 1]);
+#pragma unroll
+  for (int i = 0; i < FEATURES / 8; ++i)
+    reinterpret_cast<uint4*>(inputs)[i] = make_uint4(words[4 * i], words[4 * i + 1],
+                                                     words[4 * i + 2], words[4 * i + 3]);
+#pragma unroll
+  for (int i = FEATURES / 8 * 4; i < FEATURES / 2; ++i)
+    reinterpret_cast<uint32_t*>(inputs)[i] = words[i];
+  if (FEATURES % 2) inputs[FEATURES - 1] = __float2half_rn(values[FEATURES - 1]);
 }
 
-__device__ __forceinline__ void write_action(__half* inputs, const float (&action)[ACTION],
-                                             const float* shared) {
-#pragma unroll
-  for (int i = 0; i < ACTION; ++i)
-    inputs[FEATURES + i] = __float2half_rn(scaled(action[i], FEATURES + i, shared));
-}
-
-// Stores one observation; it is aligned to its own size as far as that is a power of 2.
-__device__ __forceinline__ void store(float* path, const float (&obs)[OBS]) {
-  if constexpr (OBS % 4 == 0) {
-#pragma unroll
-    for (int i = 0; i < OBS; i += 4)
-      *reinterpret_cast<float4*>(path + i) =
-          make_float4(obs[i], obs[i + 1], obs[i + 2], obs[i + 3]);
-  } else if constexpr (OBS % 2 == 0) {
-#pragma unroll
-    for (int i = 0; i < OBS; i += 2)
-      *reinterpret_cast<float2*>(path + i) = make_float2(obs[i], obs[i + 1]);
+// Copies VECTOR numbers out of shared memory; no branch, for use between products.
+constexpr int VECTOR = OBS % 4 == 0 ? 4 : OBS % 2 == 0 ? 2 : 1;
+__device__ __forceinline__ void store(float* to, const float* from, bool wanted) {
+  if constexpr (VECTOR == 4) {
+    const float4 v = *reinterpret_cast<const float4*>(from);
+    asm volatile(
+        "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %5, 0;\n"
+        "@wanted st.global.v4.f32 [%0], {%1, %2, %3, %4};\n}" ::"l"(to),
+        "f"(v.x), "f"(v.y), "f"(v.z), "f"(v.w), "r"(int(wanted))
+        : "memory");
+  } else if constexpr (VECTOR == 2) {
+    const float2 v = *reinterpret_cast<const float2*>(from);
+    asm volatile(
+        "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %3, 0;\n"
+        "@wanted st.global.v2.f32 [%0], {%1, %2};\n}" ::"l"(to),
+        "f"(v.x), "f"(v.y), "r"(int(wanted))
+        : "memory");
   } else {
+    asm volatile(
+        "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %2, 0;\n"
+        "@wanted st.global.f32 [%0], %1;\n}" ::"l"(to),
+        "f"(*from), "r"(int(wanted))
+        : "memory");
+  }
+}
+
+// Turns means and raw log-variances into draws; the noise stands where they go. Mean and
+// log-variance of one entry lie in the same thread, entries two by two.
+__device__ __forceinline__ void draw_targets(float* target, const float (&head)[HEAD],
+                                             const float* shared, int pair) {
 #pragma unroll
-    for (int i = 0; i < OBS; ++i) path[i] = obs[i];
+  for (int i = 0; i < HEAD / 2; i += 2) {
+    // Wait for no branch: what stands behind the last entry is computed, not stored.
+    const int column = i / 4 * 8 + 2 * pair;
+    const int at = i / 4 * 8 + 6 < OBS ? column : min(column, (OBS - 1) / 2 * 2);
+    float2* const place =
+        reinterpret_cast<float2*>(target + i % 4 / 2 * 8 * STATE_STRIDE + at);
+    const float2 low = *reinterpret_cast<const float2*>(shared + MIN_VARIANCE + at);
+    const float2 high = *reinterpret_cast<const float2*>(shared + MAX_PRECISION + at);
+    float2 value = *place;
+    value.x = head[i] + value.x * deviation(head[HEAD / 2 + i], low.x, high.x);
+    value.y = head[i + 1] + value.y * deviation(head[HEAD / 2 + i + 1], low.y, high.y);
+    if (column == at) *place = value;
   }
 }
 
 __device__ void consume(Shared& smem, const Rollout& rollout, int member, int first_row,
                         int consumer, int thread) {
-  const int warp = thread / 32, group = thread % 32 / 4, pair = thread % 4;
-  const int rows = rollout.num_candidates * rollout.particles;
-  // Between the products half the threads own a particle each, half its actions.
-  const bool owns_state = thread < TILE;
-  const int row = thread % TILE, wanted = first_row + consumer * TILE + row;
-  const int particle = min(wanted, rows - 1);
-  const int candidate = particle / rollout.particles;
+  // A warp has 16 particles from beginning to end.
+  constexpr int WARP_ROWS = TILE / 4;
+  constexpr int ACTIONS = (WARP_ROWS * ACTION + 31) / 32;  // of a lane
+  constexpr int VECTORS = (WARP_ROWS * OBS / VECTOR + 31) / 32;
+  const int warp = thread / 32, lane = thread % 32, group = lane / 4, pair = lane % 4;
+  const int own = warp * WARP_ROWS, row = own + lane % WARP_ROWS;
+  const bool owns_state = lane < WARP_ROWS;
   const int step_stride = rollout.num_members * rollout.particles * OBS;
-  const float* actions = rollout.actions + int64_t(candidate) * rollout.horizon * ACTION;
-  float* path = rollout.path + candidate * (rollout.horizon + 1) * step_stride +
-                (member * rollout.particles + particle % rollout.particles) * OBS;
-  float* const target = smem.target[consumer];
-  __half* const inputs = smem.inputs[consumer];
-  __half* const row_inputs = inputs + row * INPUT_STRIDE;
-  float obs[OBS], action[ACTION];
+  __half* const inputs = smem.inputs[consumer] + own * INPUT_STRIDE;
+  float* const states = smem.state[consumer] + own * STATE_STRIDE;
+  float* const targets = smem.target[consumer] + own * STATE_STRIDE;
+  const int* const path_offsets = smem.path_offset[consumer] + own;
+  const int* const action_offsets = smem.action_offset[consumer] + own;
+  float action[ACTIONS];
 
-  for (int i = thread; i < TILE * INPUT_STRIDE; i += WARPGROUP) {
+  const auto load_actions = [&](int step) {
+#pragma unroll
+    for (int k = 0; k < ACTIONS; ++k) {
+      const int i = min(lane + 32 * k, WARP_ROWS * ACTION - 1);
+      action[k] =
+          rollout.actions[action_offsets[i / ACTION] + step * ACTION + i % ACTION];
+    }
+  };
+  const auto write_actions = [&] {
+#pragma unroll
+    for (int k = 0; k < ACTIONS; ++k) {
+      const int i = min(lane + 32 * k, WARP_ROWS * ACTION - 1);
+      const int column = FEATURES + i % ACTION;
+      inputs[i / ACTION * INPUT_STRIDE + column] =
+          __float2half_rn(scaled(action[k], column, smem.shared));
+    }
+  };
+  const auto store_states = [&](int step) {
+#pragma unroll
+    for (int k = 0; k < VECTORS; ++k) {
+      const int i = min(lane + 32 * k, WARP_ROWS * OBS / VECTOR - 1) * VECTOR;
+      const int in_row = i % OBS, offset = path_offsets[i / OBS];
+      store(rollout.path + offset + step * step_stride + in_row,
+            states + i / OBS * STATE_STRIDE + in_row, offset >= 0);
+    }
+  };
+
+  for (int i = lane; i < WARP_ROWS * INPUT_STRIDE; i += 32) {
     const int column = i % INPUT_STRIDE;
     inputs[i] = column == INPUTS || column == INPUTS + 1 ? __half(1.0f) : __half(0.0f);
   }
-  sync_warpgroup(consumer);
   if (owns_state) {
-#pragma unroll
-    for (int i = 0; i < OBS; ++i) obs[i] = rollout.obs[i];
-    write_features(row_inputs, obs, smem.shared);
-    if (wanted < rows) store(path, obs);
-  } else {
-#pragma unroll
-    for (int i = 0; i < ACTION; ++i) action[i] = actions[i];
-    write_action(row_inputs, action, smem.shared);
+    const int rows = rollout.num_candidates * rollout.particles;
+    const int wanted = first_row + consumer * TILE + row;
+    const int particle = min(wanted, rows - 1);
+    const int candidate = particle / rollout.particles;
+    const int in_step = (member * rollout.particles + particle % rollout.particles) * OBS;
+    smem.path_offset[consumer][row] =
+        wanted < rows ? candidate * (rollout.horizon + 1) * step_stride + in_step : -1;
+    smem.action_offset[consumer][row] = candidate * rollout.horizon * ACTION;
   }
+  __syncwarp();
+  if (owns_state) {
+    float obs[OBS];
+#pragma unroll
+    for (int i = 0; i < OBS; ++i)
+      states[lane * STATE_STRIDE + i] = obs[i] = rollout.obs[i];
+    write_features(inputs + lane * INPUT_STRIDE, obs, smem.shared);
+  }
+  load_actions(0);
+  write_actions();
   sync_warpgroup(consumer);
   wait(&smem.resident_full, 0);
+  if (consumer == 1) pass_turn(consumer);  // the other one is first
 
   Cursor cursor;
   for (int step = 0; step < rollout.horizon; ++step) {
-    actions += ACTION;
-    path += step_stride;
-    if (!owns_state && step + 1 < rollout.horizon) {
-#pragma unroll
-      for (int i = 0; i < ACTION; ++i) action[i] = actions[i];
-    }
+    load_actions(min(step + 1, rollout.horizon - 1));
     float head[HEAD];
     {
-      uint32_t activations[4 * HIDDEN_CHUNKS];
-      float sums[WIDTH / 2];
-      {
-        uint32_t operand[4 * INPUT_CHUNKS];
-        const __half* from = inputs + (warp * 16 + group) * INPUT_STRIDE + 2 * pair;
+      uint32_t activations[4 * HIDDEN_CHUNKS], operand[4 * INPUT_CHUNKS];
+      const __half* from = inputs + group * INPUT_STRIDE + 2 * pair;
 #pragma unroll
-        for (int chunk = 0; chunk < INPUT_CHUNKS; ++chunk) {
-          const __half* at = from + chunk * DEPTH;
-          operand[4 * chunk] = *reinterpret_cast<const uint32_t*>(at);
-          operand[4 * chunk + 1] =
-              *reinterpret_cast<const uint32_t*>(at + 8 * INPUT_STRIDE);
-          operand[4 * chunk + 2] = *reinterpret_cast<const uint32_t*>(at + 8);
-          operand[4 * chunk + 3] =
-              *reinterpret_cast<const uint32_t*>(at + 8 * INPUT_STRIDE + 8);
-        }
-        multiply<INPUT_CHUNKS, WIDTH, INPUT_STREAMED>(sums, operand, smem.resident, smem,
-                                                      cursor);
+      for (int chunk = 0; chunk < INPUT_CHUNKS; ++chunk) {
+#pragma unroll
+        for (int i = 0; i < 4; ++i)  // rows +0 and +8, then both 8 columns on
+          operand[4 * chunk + i] = *reinterpret_cast<const uint32_t*>(
+              from + i % 2 * 8 * INPUT_STRIDE + i / 2 * 8 + chunk * DEPTH);
       }
-      activate(activations, sums, pair);
-      const __half* resident = smem.resident + RESIDENT_INPUT * HIDDEN_CHUNK;
+      __syncwarp();
+      hidden_layer<INPUT_CHUNKS, 0, 0>(activations, operand, smem.resident, smem, cursor,
+                                       pair, consumer);
+      const __half* resident = smem.resident + RESIDENT_INPUT;
 #pragma unroll 1
       for (int layer = 1; layer < LAYERS; ++layer) {
-        multiply<HIDDEN_CHUNKS, WIDTH, HIDDEN_STREAMED>(sums, activations, resident, smem,
-                                                        cursor);
-        activate(activations, sums, pair);
-        resident += RESIDENT_HIDDEN * HIDDEN_CHUNK;
+        hidden_layer<HIDDEN_CHUNKS, LEFT_STREAMED, RIGHT_STREAMED>(
+            activations, activations, resident, smem, cursor, pair, consumer);
+        resident += RESIDENT_HIDDEN;
       }
-      multiply<HIDDEN_CHUNKS, 2 * HEAD, OUTPUT_STREAMED>(
-          head, activations,
-          smem.resident + RESIDENT_WEIGHTS - RESIDENT_OUTPUT * OUTPUT_CHUNK, smem, cursor);
+      multiply<HIDDEN_CHUNKS, 2 * HEAD, 0>(head, activations, resident, smem, cursor);
+      write_actions();
+      store_states(step);
+      keep_order();
+      finish<0>(head);
     }
-
-    // Mean and raw log-variance of one entry lie in the same thread.
     wait(&smem.noise_full[consumer], step & 1);
-#pragma unroll
-    for (int i = 0; i < HEAD / 2; ++i) {
-      const int column = 8 * (i / 4) + 2 * pair + i % 2;
-      const int tile_row = warp * 16 + group + 8 * (i % 4 / 2);
-      if (column < OBS) {
-        float& value = target[tile_row * TARGET_STRIDE + column];
-        value = head[i] + value * deviation(head[HEAD / 2 + i],
-                                            smem.shared[MIN_VARIANCE + column],
-                                            smem.shared[MAX_PRECISION + column]);
-      }
-    }
-    sync_warpgroup(consumer);
+    draw_targets(targets + group * STATE_STRIDE, head, smem.shared, pair);
+    __syncwarp();
     if (owns_state) {
-      float drawn[OBS];
+      float obs[OBS], drawn[OBS];
 #pragma unroll
-      for (int i = 0; i < OBS; ++i) drawn[i] = target[row * TARGET_STRIDE + i];
+      for (int i = 0; i < OBS; ++i) {
+        obs[i] = states[lane * STATE_STRIDE + i];
+        drawn[i] = targets[lane * STATE_STRIDE + i];
+      }
       move(obs, drawn, smem.shared);
-      write_features(row_inputs, obs, smem.shared);
-      if (wanted < rows) store(path, obs);
-    } else {
-      write_action(row_inputs, action, smem.shared);
+#pragma unroll
+      for (int i = 0; i < OBS; ++i) states[lane * STATE_STRIDE + i] = obs[i];
+      write_features(inputs + lane * INPUT_STRIDE, obs, smem.shared);
     }
     sync_warpgroup(consumer);
     if (thread == 0) arrive(&smem.noise_empty[consumer]);
   }
+  store_states(rollout.horizon);
 }
 
 __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
@@ -430,13 +521,13 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
 
   const int warpgroup = threadIdx.x / WARPGROUP, thread = threadIdx.x % WARPGROUP;
   if (warpgroup == CONSUMERS) {
-    asm volatile("setmaxnreg.dec.sync.aligned.u32 40;");
+    asm volatile("setmaxnreg.dec.sync.aligned.u32 56;");
     if (thread >= 32)
       draw_noise(smem, rollout, member, first_row, thread - 32);
     else if (thread == 0)
       feed_weights(smem, weights, rollout.horizon);
   } else {
-    asm volatile("setmaxnreg.inc.sync.aligned.u32 232;");
+    asm volatile("setmaxnreg.inc.sync.aligned.u32 224;");
     consume(smem, rollout, member, first_row, warpgroup, thread);
   }
 }

@@ -24,10 +24,10 @@ _ELEMENTWISE = {
     "ceil": "ceilf({0})",
     "clamp": "lower(higher({1}, {0}), {2})",
     "copy": "{0}",
-    "cos": "cosf({0})",
+    "cos": "cosine({0})",
     "div": "({0} / {1})",
     "eq": "({0} == {1})",
-    "exp": "expf({0})",
+    "exp": "fast_exp({0})",
     "floor": "floorf({0})",
     "ge": "({0} >= {1})",
     "gt": "({0} > {1})",
@@ -35,7 +35,7 @@ _ELEMENTWISE = {
     "le": "({0} <= {1})",
     "log": "logf({0})",
     "log1p": "log1pf({0})",
-    "logistic": "(1.0f / (1.0f + expf(-{0})))",
+    "logistic": "fast_inverse(1.0f + fast_exp(-{0}))",
     "lt": "({0} < {1})",
     "max": "higher({0}, {1})",
     "min": "lower({0}, {1})",
@@ -47,7 +47,7 @@ _ELEMENTWISE = {
     "pow": "powf({0}, {1})",
     "rsqrt": "(1.0f / sqrtf({0}))",
     "select_n": "({0} ? {2} : {1})",
-    "sin": "sinf({0})",
+    "sin": "sine({0})",
     "sqrt": "sqrtf({0})",
     "square": "({0} * {0})",
     "stop_gradient": "{0}",
@@ -55,7 +55,12 @@ _ELEMENTWISE = {
     "tan": "tanf({0})",
     "tanh": "tanhf({0})",
 }
-_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min"}
+# What to do with two elements, and what is left without any.
+_REDUCTIONS = {
+    "reduce_sum": ("add", 0.0),
+    "reduce_max": ("max", -math.inf),
+    "reduce_min": ("min", math.inf),
+}
 # They only move elements: what they do to numbers, they do to names.
 _MOVES = {
     "broadcast_in_dim",
@@ -69,7 +74,10 @@ _MOVES = {
     "slice",
     "split",
     "squeeze",
+    "stack",
+    "tile",
     "transpose",
+    "unstack",
 }
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 
@@ -119,7 +127,8 @@ class _Writer:
         known: dict[Any, np.ndarray] = {}
 
         def read(atom: Any) -> np.ndarray:
-            return np.asarray(atom.val) if isinstance(atom, core.Literal) else known[atom]
+            is_number = isinstance(atom, core.Literal)
+            return np.asarray(atom.val) if is_number else known[atom]
 
         known |= dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
         known |= dict(zip(jaxpr.invars, args, strict=True))
@@ -138,14 +147,20 @@ class _Writer:
             return _bind(eqn, inputs)
         if name in _MOVES:
             return _move(eqn, inputs)
+        return [self._compute(eqn, inputs)]
+
+    def _compute(self, eqn: Any, inputs: list[np.ndarray]) -> np.ndarray:
+        name = eqn.primitive.name
         if name == "convert_element_type":
-            return [self._convert(eqn, inputs[0])]
+            return self._convert(eqn, inputs[0])
         if name == "integer_pow":
-            return [self._power(inputs[0], eqn.params["y"])]
+            return self._power(inputs[0], eqn.params["y"])
         if name in _REDUCTIONS:
-            return [self._reduce(eqn, inputs[0])]
+            return self._reduce(eqn, inputs[0])
+        if name == "select_n" and len(inputs) > 3:
+            raise UnsupportedError("a choice among more than two has no C++ form")
         if name in _ELEMENTWISE:
-            return [self._elementwise(name, eqn.outvars[0].aval, inputs)]
+            return self._elementwise(name, eqn.outvars[0].aval, inputs)
         raise UnsupportedError(f"the primitive {name!r} has no C++ form")
 
     def _assign(self, kind: str, expression: str) -> str:
@@ -182,11 +197,13 @@ class _Writer:
     def _reduce(self, eqn: Any, array: np.ndarray) -> np.ndarray:
         axes = tuple(eqn.params["axes"])
         kept = [axis for axis in range(array.ndim) if axis not in axes]
-        moved = array.transpose(*kept, *axes).reshape(*eqn.outvars[0].aval.shape, -1)
-        expression = _ELEMENTWISE[_REDUCTIONS[eqn.primitive.name]]
-        result = np.empty(moved.shape[:-1], dtype=object)
+        count = math.prod(array.shape[axis] for axis in axes)
+        result = np.empty(eqn.outvars[0].aval.shape, dtype=object)
+        moved = array.transpose(*kept, *axes).reshape(*result.shape, count)
+        name, of_nothing = _REDUCTIONS[eqn.primitive.name]
+        expression = _ELEMENTWISE[name]
         for index in np.ndindex(result.shape):
-            total, *rest = map(_text, moved[index])
+            total, *rest = map(_text, moved[index] if count else [of_nothing])
             for text in rest:
                 total = self._assign("float", expression.format(total, text))
             result[index] = total
@@ -207,8 +224,6 @@ def _move(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     places = []
     for array, atom in zip(inputs, eqn.invars, strict=True):
         if jnp.issubdtype(atom.aval.dtype, jnp.integer):
-            if array.dtype == object:
-                raise UnsupportedError("an index that depends on the state")
             places.append(array)  # where to read, not what
             continue
         first = len(pool)
@@ -216,7 +231,9 @@ def _move(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
         places.append(np.arange(first, len(pool), dtype=np.int32).reshape(array.shape))
     params = dict(eqn.params)
     if eqn.primitive.name == "gather":
-        params["fill_value"] = None
+        fill = params["fill_value"]  # of what is read past the end
+        params["fill_value"] = len(pool)
+        pool.append(math.nan if fill is None else fill)
     with jax.ensure_compile_time_eval():
         results = eqn.primitive.bind(*map(jnp.asarray, places), **params)
     results = results if eqn.primitive.multiple_results else [results]
@@ -233,7 +250,7 @@ def _kind(dtype: Any) -> str:
         return "bool"
     if dtype == jnp.float32:
         return "float"
-    raise UnsupportedError(f"values of type {dtype}")
+    raise UnsupportedError(f"values of type {dtype} have no C++ form")
 
 
 def _text(value: Any) -> str:

@@ -12,7 +12,7 @@ SHARED_MEMORY = 232_448
 _DEPTH = 16  # of one tensor core instruction
 _TILE = 64  # rows of one
 _MAX_COLUMNS = 256  # of one
-_MOST_SLOTS = 6
+_UNIT = 4  # chunks that stream together
 _HALF_MAX = 65504.0
 
 
@@ -39,8 +39,13 @@ class KernelShape:
 
     @property
     def width(self) -> int:
-        """Columns of a hidden layer."""
-        return _round_up(max(self.hidden_sizes), 8)
+        """Columns of a hidden layer; both halves need some."""
+        return max(24, _round_up(max(self.hidden_sizes), 8))
+
+    @property
+    def left(self) -> int:
+        """Columns of the left half, the larger one."""
+        return _round_up(_round_up(self.width, 16) // 2, 16)
 
     @property
     def head(self) -> int:
@@ -62,30 +67,33 @@ class KernelShape:
     def streaming(self) -> "Streaming | None":
         """Returns how to split the weights between shared memory and the ring.
 
-        As much as fits stays in shared memory; hidden layers stream first.
+        As much as fits stays in shared memory. The left halves of hidden layers stream
+        first: the right halves' products then never wait.
         """
-        chunks = [_chunks(self.input_size), _chunks(self.width)]
-        for slots in range(_MOST_SLOTS, 1, -1):
-            for hidden in range(chunks[1] + 1):
-                streaming = Streaming(0, hidden, 0, slots)
+        chunks = _chunks(self.width)
+        unit = min(_UNIT, chunks)
+        most = chunks // unit * unit
+        for slots in (3, 2):
+            for streamed in range(0, 2 * most + 1, unit):
+                left = min(streamed, most)
+                streaming = Streaming(left, streamed - left, unit, slots)
                 if self._shared_bytes(streaming) <= SHARED_MEMORY:
                     return streaming
-        streaming = Streaming(chunks[0], chunks[1], chunks[1], 2)
-        return streaming if self._shared_bytes(streaming) <= SHARED_MEMORY else None
+        return None
 
     def _shared_bytes(self, streaming: "Streaming") -> int:
-        hidden_chunk = 2 * _DEPTH * self.width
-        output_chunk = 2 * _DEPTH * 2 * self.head
         inputs, hidden = _chunks(self.input_size), _chunks(self.width)
-        resident = hidden_chunk * (inputs - streaming.input)
-        resident += (
-            hidden_chunk * (len(self.hidden_sizes) - 1) * (hidden - streaming.hidden)
+        right = self.width - self.left
+        columns = inputs * self.width + hidden * 2 * self.head
+        columns += (len(self.hidden_sizes) - 1) * (
+            (hidden - streaming.left) * self.left + (hidden - streaming.right) * right
         )
-        resident += output_chunk * (hidden - streaming.output)
-        ring = streaming.slots * max(hidden_chunk, output_chunk)
-        numbers = 4 * (2 * self.input_size + 4 * self.obs_size)
-        tile = 4 * _TILE * (self.obs_size | 1) + 2 * _TILE * (_DEPTH * inputs + 8)
-        return resident + ring + numbers + 2 * tile + 512  # barriers, alignment
+        columns += streaming.slots * streaming.unit * self.left
+        obs_words = _round_up(self.obs_size, 4) // 4
+        numbers = 2 * _round_up(self.input_size, 4) + 16 * obs_words
+        tile = 4 * 2 * _TILE * 4 * (obs_words | 1)  # state and target
+        tile += 2 * _TILE * (_DEPTH * inputs + 8) + 8 * _TILE  # inputs and offsets
+        return 2 * _DEPTH * columns + 4 * numbers + 2 * tile + 512  # and barriers
 
     def header(self) -> str:
         """Returns the constants of the C++ sources."""
@@ -97,9 +105,9 @@ class KernelShape:
             "FEATURES": self.feature_size,
             "WIDTH": self.width,
             "LAYERS": len(self.hidden_sizes),
-            "INPUT_STREAMED": streaming.input,
-            "HIDDEN_STREAMED": streaming.hidden,
-            "OUTPUT_STREAMED": streaming.output,
+            "LEFT_STREAMED": streaming.left,
+            "RIGHT_STREAMED": streaming.right,
+            "UNIT": streaming.unit,
             "SLOTS": streaming.slots,
         }
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
@@ -107,7 +115,7 @@ class KernelShape:
 
     def products(self) -> str:
         """Returns the tensor core instructions of the two widths as C++."""
-        widths = sorted({self.width, 2 * self.head})
+        widths = sorted({self.left, self.width - self.left, 2 * self.head})
         return "\n".join(["template <int COLUMNS> struct Wgmma;", *map(_wgmma, widths)])
 
     def pack(self, layers: list[dict[str, Array]]) -> Array:
@@ -120,10 +128,13 @@ class KernelShape:
         # The kernel computes swish(2 h) = h + h tanh(h).
         hidden = [jax.tree.map(lambda x: x / 2, layer) for layer in hidden]
         rows = [self.input_size] + [self.width] * len(hidden)
-        blocks = [
-            _blocks(layer["kernel"], layer["bias"], size, self.width)
-            for layer, size in zip(hidden, rows[:-1], strict=True)
-        ]
+        blocks = []
+        for layer, size in zip(hidden, rows[:-1], strict=True):
+            kernel, bias = (
+                _pad(layer[name], self.width) for name in ("kernel", "bias")
+            )
+            for half in (slice(None, self.left), slice(self.left, None)):
+                blocks.append(_blocks(kernel[..., half], bias[..., half], size))
         means, raws = (
             {name: _pad(part[..., half], self.head) for name, part in output.items()}
             for half in (slice(None, self.obs_size), slice(self.obs_size, None))
@@ -132,17 +143,17 @@ class KernelShape:
             jnp.concatenate([means[name], raws[name]], axis=-1)
             for name in ("kernel", "bias")
         )
-        blocks.append(_blocks(kernel, bias, rows[-1], 2 * self.head))
+        blocks.append(_blocks(kernel, bias, rows[-1]))
         return jnp.concatenate(blocks, axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Streaming:
-    """Chunks per layer that stream, and the slots of the ring they stream through."""
+    """Chunks that stream of each half layer, how many at once, and the ring's slots."""
 
-    input: int
-    hidden: int
-    output: int
+    left: int
+    right: int
+    unit: int
     slots: int
 
 
@@ -160,8 +171,8 @@ def _pad(array: Array, size: int) -> Array:
     return jnp.pad(array, widths)
 
 
-def _blocks(kernel: Array, bias: Array, rows: int, columns: int) -> Array:
-    """Lays one layer out as chunks of 16 rows, each as blocks of 8 x 8.
+def _blocks(kernel: Array, bias: Array, rows: int) -> Array:
+    """Lays a layer, or half of one, out as chunks of 16 rows, each as blocks of 8 x 8.
 
     The bias stands below the `rows` rows, as float16 and, in the row after, what that
     left. Order within a chunk: 8 columns, two halves of the rows, column, row.
@@ -170,9 +181,9 @@ def _blocks(kernel: Array, bias: Array, rows: int, columns: int) -> Array:
     rounded = _half(bias)
     rest = _half(bias - rounded.astype(jnp.float32))
     whole = jnp.concatenate([kernel, rounded[:, None], rest[:, None]], axis=1)
-    members, _, width = whole.shape
+    members, _, columns = whole.shape
     height = _DEPTH * _chunks(rows)
-    whole = jnp.pad(whole, ((0, 0), (0, height - rows - 2), (0, columns - width)))
+    whole = jnp.pad(whole, ((0, 0), (0, height - rows - 2), (0, 0)))
     whole = whole.reshape(members, height // _DEPTH, 2, 8, columns // 8, 8)
     return whole.transpose(0, 1, 4, 2, 5, 3).reshape(members, -1)
 

@@ -1,0 +1,226 @@
+"""The kernel's sizes fit the GPU, and parameters lie where it reads them."""
+
+import dataclasses
+import itertools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpets._src.kernel.shape import SHARED_MEMORY, KernelShape
+
+SMALL = KernelShape(obs_size=5, action_size=2, feature_size=7, hidden_sizes=(20, 33))
+PAPER = KernelShape(18, 6, 18, (200, 200, 200, 200))
+SHAPES = {
+    "small": SMALL,
+    "one layer": KernelShape(1, 1, 1, (1,)),
+    "paper": PAPER,
+    "narrow first": KernelShape(3, 2, 4, (8, 64, 24)),
+    "full chunks": KernelShape(8, 6, 8, (30, 30)),  # 14 inputs and two biases
+}
+
+
+def layers_of(shape, members=2, seed=0):
+    """Parameters `[E, in, out]` and `[E, out]` of each layer."""
+    rng = np.random.default_rng(seed)
+    sizes = [shape.input_size, *shape.hidden_sizes, 2 * shape.obs_size]
+    return [
+        {
+            "kernel": rng.normal(size=(members, a, b)).astype(np.float32),
+            "bias": rng.normal(size=(members, b)).astype(np.float32),
+        }
+        for a, b in itertools.pairwise(sizes)
+    ]
+
+
+def unpacked(numbers, rows, columns):
+    """Reads a matrix `[E, chunks * 16, columns]` from the front; returns the rest.
+
+    By what rollout.h says: chunks of 16 rows follow one another; in a chunk, blocks of
+    8 x 8 lie 8 columns after 8 columns, for each the upper rows first; in a block,
+    column after column.
+    """
+    chunks = -(-(rows + 2) // 16)
+    row, column = np.indices((chunks * 16, columns))
+    block = (column // 8) * 2 + row % 16 // 8
+    place = row // 16 * 16 * columns + block * 64 + column % 8 * 8 + row % 8
+    return numbers[:, place], numbers[:, chunks * 16 * columns :]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_parameters_lie_as_documented(name):
+    shape, layers = SHAPES[name], layers_of(SHAPES[name])
+    packed = jax.jit(shape.pack)(layers)
+    assert packed.dtype == jnp.float16
+    rest = np.float64(packed)
+    width = max(24, -(-max(shape.hidden_sizes) // 8) * 8)
+    left = -(-(-(-width // 16) * 16 // 2) // 16) * 16
+    head = -(-shape.obs_size // 8) * 8
+    assert (shape.width, shape.left, shape.head) == (width, left, head)
+    assert 0 < width - left <= left and (width - left) % 8 == 0
+    rows = [shape.input_size] + [width] * len(shape.hidden_sizes)
+    for i, (layer, size) in enumerate(zip(layers, rows, strict=True)):
+        kernel, bias = (np.float64(layer[name]) for name in ("kernel", "bias"))
+        is_head = i == len(layers) - 1
+        if is_head:
+            found, rest = unpacked(rest, size, 2 * head)
+            entries = np.arange(shape.obs_size)
+            columns = np.concatenate([entries, head + entries])
+        else:
+            halves = []
+            for columns in (left, width - left):
+                half, rest = unpacked(rest, size, columns)
+                halves.append(half)
+            found = np.concatenate(halves, axis=-1)
+            columns = np.arange(kernel.shape[2])
+            kernel, bias = kernel / 2, bias / 2  # swish(2 h) = h + h tanh(h)
+        inner = kernel.shape[1]
+        # Float16 has 11 bits, two of them 22; but 2^-24 is the least number.
+        got = found[:, :inner, columns]
+        np.testing.assert_allclose(got, kernel, rtol=2**-11, atol=2**-25)
+        got = found[:, size, columns] + found[:, size + 1, columns]
+        np.testing.assert_allclose(got, bias, rtol=2**-21, atol=2**-24)
+        # Everything else is zero.
+        found[:, :inner, columns] = found[:, size : size + 2, columns] = 0
+        assert not found.any()
+    assert rest.shape == (2, 0)
+
+
+def test_what_float16_cannot_hold_is_as_large_as_can_be():
+    layers = layers_of(SMALL)
+    layers[0]["kernel"][0, 0, 0] = 1e6
+    layers[0]["kernel"][0, 0, 1] = -np.inf
+    layers[0]["kernel"][1, 0, 0] = np.nan
+    packed = np.float64(jax.jit(SMALL.pack)(layers))
+    found, _ = unpacked(packed, SMALL.input_size, SMALL.left)
+    assert found[0, 0, 0] == 65504 and found[0, 0, 1] == -65504
+    assert np.isnan(found[1, 0, 0])
+    assert np.isfinite(packed[0]).all()
+
+
+def test_members_do_not_mix():
+    layers = layers_of(SMALL, members=3)
+    pack = jax.jit(SMALL.pack)
+    packed = pack(layers)
+    for e in range(3):
+        one = pack(jax.tree.map(lambda x, e=e: x[e : e + 1], layers))
+        np.testing.assert_array_equal(packed[e], one[0])
+
+
+def bytes_of(shape, streaming):
+    """Shared memory as rollout.cu declares it."""
+    inputs = -(-(shape.input_size + 2) // 16)
+    hidden = -(-(shape.width + 2) // 16)
+    right = shape.width - shape.left
+    numbers = inputs * 16 * shape.width + hidden * 16 * 2 * shape.head
+    for _ in shape.hidden_sizes[1:]:
+        numbers += (hidden - streaming.left) * 16 * shape.left
+        numbers += (hidden - streaming.right) * 16 * right
+    numbers += streaming.slots * streaming.unit * 16 * shape.left
+    words = -(-shape.obs_size // 4)
+    shared = 2 * 4 * -(-shape.input_size // 4) + 4 * 4 * words
+    stride = 4 * (words if words % 2 else words + 1)
+    tiles = 2 * (2 * 64 * stride) + 2 * (64 * 2)  # of state and target, and offsets
+    inputs_tile = 2 * 64 * (inputs * 16 + 8)
+    barriers = 8 * (1 + 2 * streaming.slots + 4)
+    return 2 * (numbers + inputs_tile) + 4 * (shared + tiles) + barriers
+
+
+def test_every_model_that_is_accepted_fits_into_shared_memory():
+    """And keeps there as much as it can."""
+    fitting = []
+    for width in (1, 24, 25, 32, 64, 100, 128, 200, 240, 256):
+        for depth in (1, 2, 4, 8):
+            for obs_size, inputs in ((1, 1), (8, 4), (18, 6), (47, 30), (128, 128)):
+                shape = KernelShape(obs_size, inputs, obs_size, (width,) * depth)
+                streaming = shape.streaming()
+                if streaming is None:
+                    assert shape.problem() is not None
+                    continue
+                assert shape.problem() is None
+                fitting.append((width, depth, obs_size))
+                hidden = -(-(shape.width + 2) // 16)
+                assert bytes_of(shape, streaming) <= SHARED_MEMORY
+                for part in (streaming.left, streaming.right):
+                    assert 0 <= part <= hidden and part % streaming.unit == 0
+                assert 0 < streaming.unit <= hidden and streaming.slots in (2, 3)
+                if streaming.right:  # the left half streams first, as far as it can
+                    assert streaming.left == hidden // streaming.unit * streaming.unit
+                if streaming.left:
+                    assert bytes_of(shape, stayed(streaming)) > SHARED_MEMORY - 2048
+    assert (256, 8, 18) in fitting and (128, 8, 47) in fitting
+    assert (256, 1, 128) not in fitting
+
+
+def stayed(streaming):
+    """The same, but one unit less streams."""
+    name = "right" if streaming.right else "left"
+    less = getattr(streaming, name) - streaming.unit
+    return dataclasses.replace(streaming, **{name: less})
+
+
+def test_a_small_model_stays_in_shared_memory():
+    streaming = SMALL.streaming()
+    assert (streaming.left, streaming.right) == (0, 0)
+    assert PAPER.streaming().left > 0
+
+
+@pytest.mark.parametrize(
+    ("shape", "problem"),
+    [
+        (KernelShape(18, 6, 18, (256, 8)), None),
+        (KernelShape(18, 6, 18, (8, 257)), "hidden layers are wider than 256"),
+        (KernelShape(128, 6, 18, (64,)), None),
+        (KernelShape(129, 6, 18, (64,)), "observations have more than 128 entries"),
+        (KernelShape(18, 56, 200, (64,)), None),
+        (
+            KernelShape(18, 57, 200, (64,)),
+            "features and action have more than 256 entries",
+        ),
+        (
+            KernelShape(128, 128, 128, (256,)),
+            "the model does not fit into the GPU's shared memory",
+        ),
+    ],
+)
+def test_what_is_too_large_is_said(shape, problem):
+    assert shape.problem() == problem
+
+
+def test_the_header_has_every_constant():
+    streaming = PAPER.streaming()
+    pairs = re.findall(r"constexpr int (\w+) = (\d+);", PAPER.header())
+    assert len(pairs) == len(PAPER.header().splitlines())
+    assert {name: int(value) for name, value in pairs} == {
+        "OBS": 18,
+        "ACTION": 6,
+        "FEATURES": 18,
+        "WIDTH": 200,
+        "LAYERS": 4,
+        "LEFT_STREAMED": streaming.left,
+        "RIGHT_STREAMED": streaming.right,
+        "UNIT": streaming.unit,
+        "SLOTS": streaming.slots,
+    }
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_one_instruction_for_each_width_of_products(name):
+    shape = SHAPES[name]
+    text = shape.products()
+    widths = {shape.left, shape.width - shape.left, 2 * shape.head}
+    assert text.count("template <> struct Wgmma<") == len(widths)
+    for width in widths:
+        assert width % 8 == 0 and 8 <= width <= 256  # what the instruction takes
+        (body,) = re.findall(
+            rf"template <> struct Wgmma<{width}> {{(.*?)\n}};", text, re.DOTALL
+        )
+        assert f"m64n{width}k16.f32.f16.f16" in body
+        assert f"float (&sums)[{width // 2}]" in body
+        assert re.findall(r'"\+f"\(sums\[(\d+)\]\)', body) == [
+            str(i) for i in range(width // 2)
+        ]
+        operands = sorted({int(i) for i in re.findall(r"%(\d+)", body)})
+        assert operands == list(range(width // 2 + 6))  # a0 to a3, weights, add
