@@ -12,6 +12,7 @@ SET = (
     (fit, "--seeds 1 4 16"),
     (rollout, "--precision bf16 tf32 f32"),
     (env, "--batch 1 256"),
+    (plan, "--engine scan kernel --seeds 1 4 16"),  # last: it ends where no kernel runs
 )
 
 

@@ -1,12 +1,18 @@
 """Time of one action of model-predictive control, over precision and seeds.
 
 Each seed has its own model; the time of a row is that of all its seeds together.
+
+With `--gemm`, `gemm_fraction` is the rate of the plan's matrix products over that of
+bare ones in the same precision, `f32_gemm_fraction` over that of bare ones in float32:
+a large square or one hidden layer, whichever is faster, run in turn with the plan. Of
+each the fastest run counts.
 """
 
 import argparse
 import dataclasses
+import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -17,8 +23,8 @@ from benchmarks import rows, timing, workloads
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (
-    "precision", "seeds", "num_samples", "horizon", "compile_s", "min_ms", "median_ms",
-    "ms_per_seed", "tflops_per_s",
+    "engine", "precision", "seeds", "num_samples", "horizon", "compile_s", "min_ms",
+    "median_ms", "ms_per_seed", "tflops_per_s", "gemm_fraction",
 )  # fmt: skip
 
 
@@ -29,16 +35,19 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         args.num_samples or [base.num_samples], args.horizon or [base.horizon]
     ):
         size = dataclasses.replace(base, num_samples=num_samples, horizon=horizon)
-        for precision in args.precision:
+        for engine, precision in itertools.product(args.engine, args.precision):
             for seeds in args.seeds:
-                yield measure(size, precision, seeds, args)
+                yield measure(size, engine, precision, seeds, args)
 
 
 def measure(
-    size: workloads.Size, precision: str, seeds: int, args: argparse.Namespace
-) -> dict[str, Any]:
+    size: workloads.Size, engine: str, precision: str, seeds: int,
+    args: argparse.Namespace,
+) -> dict[str, Any]:  # fmt: skip
     """Times one planner."""
-    planner = workloads.planner(size, precision, args.optimizer, args.reward)
+    planner = workloads.planner(
+        size, precision, args.optimizer, args.reward, args.chunk_size, engine
+    )
     keys = jax.random.split(jax.random.key(0), seeds)
 
     @jax.jit
@@ -48,9 +57,10 @@ def measure(
         return workloads.plan_params(size, key, args.reward), planner.init(), obs
 
     params, state, obs = prepare(keys)
-    result = timing.measure(
-        jax.vmap(planner.step), params, keys, state, obs, repeats=args.repeats
-    )
+    inputs = (params, keys, state, obs)
+    step, compile_s = timing.compile_program(jax.vmap(planner.step), *inputs)
+    call = functools.partial(step, *inputs)
+    result = timing.repeat(call, compile_s, repeats=args.repeats)
     candidates = workloads.candidates_per_action(size, args.optimizer)
     flops = seeds * workloads.rollout_flops(size, candidates)
     sizes = {
@@ -59,7 +69,10 @@ def measure(
         "seeds": seeds,
         "optimizer": args.optimizer,
         "reward": args.reward,
+        "chunk_size": args.chunk_size,
+        "engine": engine,
     }
+    beside = beside_gemm(call, flops, size, precision, args) if args.gemm else {}
     return rows.make_row(
         "plan",
         sizes,
@@ -67,7 +80,33 @@ def measure(
         ms_per_seed=result.median_ms / seeds,
         gflop=flops / 1e9,
         tflops_per_s=flops / result.median_ms / 1e9,
+        **beside,
     )
+
+
+def beside_gemm(
+    call: Callable[[], Any],
+    flops: float,
+    size: workloads.Size,
+    precision: str,
+    args: argparse.Namespace,
+) -> dict[str, float]:
+    """Compares a compiled plan with bare matrix products, run in turn with it."""
+    side = 8192 if jax.default_backend() == "gpu" else 2048
+    side = 64 if args.tiny else side
+    bare = {name: workloads.products(size, name, side) for name in ("f32", precision)}
+    rate, best = 0.0, dict.fromkeys(bare, 0.0)
+    for _ in range(args.repeats):
+        rate = max(rate, flops / timing.seconds(call))
+        for name, products in bare.items():
+            for work, product in products:
+                seconds = min(timing.seconds(product) for _ in range(20))
+                best[name] = max(best[name], work / seconds)
+    return {
+        "gemm_tflops_per_s": best[precision] / 1e12,
+        "gemm_fraction": rate / best[precision],
+        "f32_gemm_fraction": rate / best["f32"],
+    }
 
 
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
@@ -77,11 +116,19 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--precision", nargs="+", choices=workloads.PRECISIONS, default=["bf16"]
     )
+    parser.add_argument("--engine", nargs="+", choices=workloads.ENGINES,
+                        default=["scan"], help="what imagines")  # fmt: skip
     parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1, 4, 16])
     parser.add_argument("--num-samples", nargs="+", type=rows.positive)
     parser.add_argument("--horizon", nargs="+", type=rows.positive)
     parser.add_argument("--optimizer", choices=workloads.OPTIMIZERS, default="cem")
     parser.add_argument("--reward", choices=workloads.REWARDS, default="epistemic")
+    parser.add_argument(
+        "--chunk-size", type=rows.positive, help="candidates at a time; default all"
+    )
+    parser.add_argument(
+        "--gemm", action="store_true", help="compare with bare matrix products"
+    )
     args = parser.parse_args(argv)
     return rows.report(run(args), COLUMNS, args.json)
 

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 from benchmarks import env, rows, timing, workloads
+from jaxpets.envs import half_cheetah
 
 COLUMNS = ("first_ms", "second_ms", "ratio", "ratio_of_min", "first", "second")
 Call = Callable[[], Any]
@@ -45,12 +46,12 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         (
             f"{steps} env steps, MJX",
             f"{steps} env steps, C",
-            lambda: (env.mjx_call(1, steps)[0], env.mujoco_call(steps)),
+            lambda: (mjx_call(1, steps), env.loop_call(steps)),
         ),
         (
             f"{steps} env steps, 16 x C",
             f"{steps} env steps, MJX batch 16",
-            lambda: (env.mujoco_call(16 * steps), env.mjx_call(16, steps)[0]),
+            lambda: (env.loop_call(16 * steps), mjx_call(16, steps)),
         ),
     ]
     # Two pairs that compile fast show that it works.
@@ -58,6 +59,11 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         result = timing.compare(*build(), repeats=args.repeats)
         sizes = {"first": first, "second": second, "size": args.size}
         yield rows.make_row("ratios", sizes, **result._asdict())
+
+
+def mjx_call(batch: int, steps: int) -> Call:
+    """Returns `steps` steps of a batch on MJX, compiled."""
+    return env.env_call(half_cheetah.half_cheetah(), batch, steps)[0]
 
 
 def plan_call(size: workloads.Size, precision: str, search: str) -> Call:

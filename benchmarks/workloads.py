@@ -6,7 +6,9 @@ longer or shorter for other values.
 
 import argparse
 import dataclasses
+import functools
 import itertools
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -32,6 +34,7 @@ class Size:
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
 
 
+ENGINES = ("scan", "kernel")
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
@@ -70,38 +73,61 @@ def chosen_size(args: argparse.Namespace) -> Size:
     return named_size("tiny" if args.tiny else args.size)
 
 
-def model(size: Size, precision: str) -> jaxpets.Ensemble:
-    """Returns the ensemble of PETS on HalfCheetah."""
-    config = jaxpets.EnsembleConfig(
+def ensemble_config(size: Size, precision: str) -> jaxpets.EnsembleConfig:
+    """Returns the configuration of the ensemble of PETS."""
+    return jaxpets.EnsembleConfig(
         num_members=size.num_members,
         hidden_sizes=size.hidden_sizes,
+        weight_decays=(1e-4,) * (len(size.hidden_sizes) + 1),  # as good as any for time
         precision=jaxpets.Precision(precision),
     )
+
+
+def model(size: Size, precision: str) -> jaxpets.Ensemble:
+    """Returns the ensemble of PETS on HalfCheetah."""
     return jaxpets.ensemble(
-        config,
+        ensemble_config(size, precision),
         half_cheetah.model_space(),
         obs_size=half_cheetah.OBS_SIZE,
         action_size=half_cheetah.ACTION_SIZE,
     )
 
 
-def rollout_fn(size: Size, precision: str) -> jaxpets.RolloutFn:
-    """Returns the particle rollout of the ensemble."""
-    return jaxpets.particle_rollout(
-        model(size, precision).sample,
-        num_members=size.num_members,
-        num_particles=size.num_particles,
-    )
+def rollout_fn(size: Size, precision: str, engine: str = "scan") -> jaxpets.RolloutFn:
+    """Returns the particle rollout of the ensemble.
+
+    Raises:
+      SystemExit: if there can be no kernel: a scan must not be timed in its name.
+    """
+    if engine == "scan":
+        return jaxpets.particle_rollout(
+            model(size, precision).sample,
+            num_members=size.num_members,
+            num_particles=size.num_particles,
+        )
+    try:
+        with warnings.catch_warnings(action="error"):
+            return jaxpets.fused_rollout(
+                ensemble_config(size, precision),
+                half_cheetah.model_space(),
+                obs_size=half_cheetah.OBS_SIZE,
+                action_size=half_cheetah.ACTION_SIZE,
+                num_particles=size.num_particles,
+            )
+    except UserWarning as warning:
+        raise SystemExit(f"no kernel to time: {warning}") from warning
 
 
-def rollout_work(size: Size, precision: str) -> tuple[jaxpets.RolloutFn, tuple]:
+def rollout_work(
+    size: Size, precision: str, engine: str = "scan"
+) -> tuple[jaxpets.RolloutFn, tuple]:
     """Returns the rollout of one iteration of planning, and what it is called with."""
     params_key, action_key, key = jax.random.split(jax.random.key(0), 3)
     start = jax.jit(lambda key: params(size, key))(params_key)
     shape = (size.num_samples, size.horizon, half_cheetah.ACTION_SIZE)
     actions = jax.random.uniform(action_key, shape, jnp.float32, -1.0, 1.0)
     obs = jnp.zeros((half_cheetah.OBS_SIZE,), jnp.float32)
-    return rollout_fn(size, precision), (start, key, obs, actions)
+    return rollout_fn(size, precision, engine), (start, key, obs, actions)
 
 
 def optimizer(size: Size, name: str) -> jaxpets.TrajectoryOptimizer:
@@ -119,7 +145,12 @@ def optimizer(size: Size, name: str) -> jaxpets.TrajectoryOptimizer:
 
 
 def planner(
-    size: Size, precision: str, search: str = "cem", reward: str = "epistemic"
+    size: Size,
+    precision: str,
+    search: str = "cem",
+    reward: str = "epistemic",
+    chunk_size: int | None = None,
+    engine: str = "scan",
 ) -> jaxpets.Planner:
     """Returns the model-predictive controller of PETS."""
     rewards = {
@@ -127,8 +158,35 @@ def planner(
         "task": half_cheetah.task_reward,
     }
     return jaxpets.plan(
-        rollout_fn(size, precision), rewards[reward], optimizer(size, search)
+        rollout_fn(size, precision, engine),
+        rewards[reward],
+        optimizer(size, search),
+        chunk_size=chunk_size,
     )
+
+
+def products(size: Size, precision: str, side: int) -> list[tuple[float, Callable]]:
+    """Returns bare matrix products, each with its operations and its compiled call.
+
+    They are a square of `side`, and the batch of a hidden layer of one model step,
+    `[E, N * P, W] x [E, W, W]`, both in the precision of the network's products.
+    """
+    rows = size.num_samples * size.num_particles // size.num_members
+    width = size.hidden_sizes[0]
+    dtype = jnp.bfloat16 if precision == "bf16" else jnp.float32
+    exact = jax.lax.Precision.HIGHEST if precision == "f32" else None
+
+    def product(x: Array, y: Array) -> Array:
+        return jnp.matmul(x, y, precision=exact, preferred_element_type=jnp.float32)
+
+    done = []
+    for batch, many, inner in [(1, side, side), (size.num_members, rows, width)]:
+        x = jnp.full((batch, many, inner), 0.5, dtype)
+        y = jnp.full((batch, inner, inner), 0.5, dtype)
+        compiled = jax.jit(product).lower(x, y).compile()
+        call = functools.partial(compiled, x, y)
+        done.append((2.0 * batch * many * inner**2, call))
+    return done
 
 
 def fitter(size: Size, num_epochs: int = 5, batch_size: int = 32) -> jaxpets.Fitter:
