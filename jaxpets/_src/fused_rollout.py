@@ -38,9 +38,10 @@ def fused_rollout(
 
     It computes what `particle_rollout(ensemble(config, space, ...).sample, ...)` does,
     with the same noise for the same key. Products read float16 and add up in float32:
-    closer to float32 than the scan in bfloat16, but an input of the network, or of one of
-    its layers, beyond 65504 is infinite and leads to NaN, which a planner counts as the
-    worst. Where there can be no kernel the scan runs, and a warning of one line says why:
+    closer to float32 than the scan in bfloat16, but an input of the network, or of one
+    of its layers, beyond 65504 is infinite and leads to NaN, which a planner counts as
+    the worst. Where there can be no kernel the scan runs, and a warning of one line
+    says why:
 
     - `config.precision` is not BF16, the only precision the kernel has;
     - the first device is no GPU of compute capability 9.0 (H100, H200, GH200);
