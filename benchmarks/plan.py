@@ -24,7 +24,7 @@ from jaxpets.envs import half_cheetah
 
 COLUMNS = (
     "engine", "precision", "seeds", "num_samples", "horizon", "compile_s", "min_ms",
-    "median_ms", "ms_per_seed", "tflops_per_s", "gemm_fraction",
+    "median_ms", "ms_per_plan", "tflops_per_s", "gemm_fraction",
 )  # fmt: skip
 
 
@@ -76,8 +76,12 @@ def measure(
     return rows.make_row(
         "plan",
         sizes,
+        name="jaxpets",
+        dtype=precision,
+        seeds=seeds,
+        engine=engine,
+        ms_per_plan=result.median_ms / seeds,
         **result._asdict(),
-        ms_per_seed=result.median_ms / seeds,
         gflop=flops / 1e9,
         tflops_per_s=flops / result.median_ms / 1e9,
         **beside,

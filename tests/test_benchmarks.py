@@ -105,7 +105,7 @@ def test_work_of_the_paper_is_what_is_published():
 
 def test_plan_over_seeds_and_samples(tmp_path):
     path = tmp_path / "rows.jsonl"
-    results = {"ms_per_seed", "gflop", "tflops_per_s"}
+    results = {"ms_per_plan", "gflop", "tflops_per_s"}
     common = ["--tiny", "--repeats", "2", "--json", str(path)]
     found = plan.main(["--seeds", "2", *common])
     check_rows(found, path, results)
