@@ -27,12 +27,12 @@ ENVIRONMENT = {"benchmark", "date", "device", "cpus", "versions", "sizes"}
 TIMING = {"compile_s", "min_ms", "median_ms", "repeats"}
 
 
-def check_rows(found, path, results):
+def check_rows(found, path, results, labels=()):
     """Rows are complete, positive, and the same in the file."""
     written = [json.loads(line) for line in path.read_text().splitlines()]
     assert json.loads(json.dumps(found)) == written[-len(found) :]
     for row in found:
-        assert set(row) == ENVIRONMENT | TIMING | set(results)
+        assert set(row) == ENVIRONMENT | TIMING | {*results, *labels}
         assert row["device"] == jax.devices()[0].device_kind
         assert row["versions"]["jax"] == jax.__version__
         assert 0 < row["min_ms"] <= row["median_ms"]
@@ -106,15 +106,17 @@ def test_work_of_the_paper_is_what_is_published():
 def test_plan_over_seeds_and_samples(tmp_path):
     path = tmp_path / "rows.jsonl"
     results = {"ms_per_plan", "gflop", "tflops_per_s"}
+    labels = {"name": "jaxpets", "dtype": "bf16", "engine": "scan", "seeds": 2}
     common = ["--tiny", "--repeats", "2", "--json", str(path)]
     found = plan.main(["--seeds", "2", *common])
-    check_rows(found, path, results)
+    check_rows(found, path, results, labels)
+    assert found[0].items() >= labels.items()
     size = workloads.named_size("tiny")
     flops = workloads.rollout_flops(size, size.num_samples * size.num_iterations)
     assert found[0]["gflop"] == pytest.approx(2 * flops / 1e9)
     flags = "--seeds 1 --num-samples 8 --horizon 2 --optimizer icem --reward task"
     found = plan.main([*flags.split(), "--precision", "f32", *common])
-    check_rows(found, path, results)
+    check_rows(found, path, results, labels)
     wanted = {"num_samples": 8, "horizon": 2, "optimizer": "icem", "precision": "f32"}
     assert found[0]["sizes"].items() >= wanted.items()
 
