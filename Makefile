@@ -19,7 +19,7 @@ explore: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase report --out $(OUT)
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .

@@ -16,11 +16,12 @@ import pytest
 # Strict promotion finds every place where the library leans on implicit casts.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Tests that trace the same program anew share its compilation. The directory is private
-# and lives as long as the run; JAX_COMPILATION_CACHE_DIR names one that stays.
+# Tests that trace the same program anew share its compilation, over all workers. The
+# directory lives as long as the run; JAX_COMPILATION_CACHE_DIR names one that stays.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.mkdtemp(prefix="jaxpets-tests-")
     atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
     jax.config.update("jax_compilation_cache_dir", _cache)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
