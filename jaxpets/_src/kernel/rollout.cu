@@ -1,7 +1,7 @@
 // A whole particle rollout in one kernel.
 //
 // A block owns 128 particles of one member for all H steps. Two consumer warpgroups take
-// 64 each. Their activations stay in registers: the accumulators of one layer, through
+// a tile of 64 each; where multiprocessors would idle, blocks own one tile. Their activations stay in registers: the accumulators of one layer, through
 // swish, are the left operand of the next layer's products, and only weights come from
 // shared memory. While one warpgroup rounds and squashes, the other keeps the tensor
 // cores busy. A member's weights do not fit into shared memory: as many chunks as do
@@ -24,6 +24,9 @@ constexpr int WARPGROUP = 128;
 constexpr int CONSUMERS = 2;
 constexpr int THREADS = (CONSUMERS + 1) * WARPGROUP;
 constexpr int NOISE_WARPS = 3;
+// All that streams of a layer fits into the ring. If not, a slot is needed again before
+// the other consumer has read it, and they cannot take turns.
+constexpr bool FITS = LEFT_STREAMED + RIGHT_STREAMED <= SLOTS * UNIT;
 
 // An odd number of 16 byte words: a thread a row, four numbers at once, and no conflicts.
 constexpr int STATE_STRIDE = 4 * (round_up(OBS, 4) / 4 | 1);
@@ -49,6 +52,42 @@ struct alignas(128) Shared {
   uint64_t resident_full, ring_full[SLOTS], ring_empty[SLOTS];
   uint64_t noise_full[CONSUMERS], noise_empty[CONSUMERS];
 };
+
+__host__ __device__ __forceinline__ int blocks_of_member(const Rollout& rollout) {
+  const int rows = rollout.num_candidates * rollout.particles;
+  return (rows + CONSUMERS * TILE - 1) / (CONSUMERS * TILE);
+}
+
+// Blocks of two tiles, and after them those that are cut in two blocks of one tile.
+struct Split {
+  int whole, halved;
+};
+
+// The blocks that are left for a last, partial wave are cut if the multiprocessors have
+// room for twice as many: one tile alone takes less time than two.
+Split split_up(const Rollout& rollout, int multiprocessors) {
+  const int blocks = blocks_of_member(rollout) * rollout.num_members * rollout.batch;
+  const int left = blocks % multiprocessors;
+  const int halved = 2 * left <= multiprocessors ? left : 0;
+  return {blocks - halved, halved};
+}
+
+struct Block {
+  int batch, member, first_row, tiles;
+};
+
+__device__ __forceinline__ Block find_block(const Rollout& rollout, const Split& split,
+                                            int index) {
+  const int half = index - split.whole;
+  const bool is_half = half >= 0;
+  if (is_half) index = split.whole + half / 2;
+  const int blocks = blocks_of_member(rollout), of_batch = blocks * rollout.num_members;
+  const int first_row =
+      (index % blocks * CONSUMERS + (is_half ? half % 2 : 0)) * TILE;
+  const int rows = rollout.num_candidates * rollout.particles - first_row;
+  const int tiles = rows <= 0 ? 0 : rows <= TILE || is_half ? 1 : 2;
+  return {index / of_batch, index % of_batch / blocks, first_row, tiles};
+}
 
 __device__ __forceinline__ uint32_t address(const void* pointer) {
   return static_cast<uint32_t>(__cvta_generic_to_shared(pointer));
@@ -161,15 +200,15 @@ __device__ void feed_weights(Shared& smem, const uint16_t* weights, int horizon)
 }
 
 // Draws the noise of `jax.random.normal(key of the step, [E, N, P, OBS])`.
-__device__ void draw_noise(Shared& smem, const Rollout& rollout, int member,
-                           int first_row, int thread) {
+__device__ void draw_noise(Shared& smem, const Rollout& rollout, const Block& block,
+                           int thread) {
   constexpr int STRIDE = NOISE_WARPS * 32, PER_TILE = TILE * OBS, AT_ONCE = 6;
   constexpr bool EXACT = PER_TILE % (STRIDE * AT_ONCE) == 0;
   for (int step = 0; step < rollout.horizon; ++step) {
     const uint32_t* key = rollout.keys + KEY * step;
     const uint32_t key0 = key[0], key1 = key[1];
-    uint32_t counter = noise_counter(rollout, key, member, first_row) + thread;
-    for (int consumer = 0; consumer < CONSUMERS; ++consumer) {
+    uint32_t counter = noise_counter(rollout, key, block.member, block.first_row) + thread;
+    for (int consumer = 0; consumer < block.tiles; ++consumer) {
       wait(&smem.noise_empty[consumer], (step & 1) ^ 1);
       for (int i = thread; i < PER_TILE; i += STRIDE * AT_ONCE) {
         uint32_t bits[AT_ONCE];
@@ -193,8 +232,14 @@ __device__ void draw_noise(Shared& smem, const Rollout& rollout, int member,
   }
 }
 
+// No branch, for use between products.
 __device__ __forceinline__ void release(Shared& smem, int slot) {
-  if (threadIdx.x % 32 == 0) arrive(&smem.ring_empty[slot]);
+  asm volatile(
+      "{\n.reg .pred first;\nsetp.eq.u32 first, %1, 0;\n"
+      "@first mbarrier.arrive.shared::cta.b64 _, [%0];\n}" ::"r"(
+          address(&smem.ring_empty[slot])),
+      "r"(threadIdx.x % 32)
+      : "memory");
 }
 
 // Starts sums = activations x weights, as groups of products in flight. A slot of the
@@ -209,15 +254,24 @@ __device__ __forceinline__ int multiply(float (&sums)[COLUMNS / 2],
   constexpr int CHUNK_STRIDE = DEPTH * COLUMNS * 2 / 16;  // in units of descriptors
   uint64_t weights = weight_descriptor(address(resident));
   int pending = -1;
+  if constexpr (FITS) {
+    // Now, not between the products: nvcc runs no two of them at once around a branch.
+    Cursor ahead = cursor;
+#pragma unroll
+    for (int unit = 0; unit < STREAMED / UNIT; ++unit) {
+      wait(&smem.ring_full[ahead.slot], ahead.round);
+      ahead.advance();
+    }
+  }
   wgmma_fence();
 #pragma unroll
   for (int chunk = 0; chunk < CHUNKS; ++chunk) {
     const bool streamed = chunk >= RESIDENT;
     const int in_unit = (chunk - RESIDENT) % UNIT;
     if (streamed && in_unit == 0) {
-      wait(&smem.ring_full[cursor.slot], cursor.round);
+      if constexpr (!FITS) wait(&smem.ring_full[cursor.slot], cursor.round);
       weights = weight_descriptor(address(smem.ring[cursor.slot]));
-      wgmma_fence();  // or nvcc 13.0, after the branch, lets no two products run at once
+      if constexpr (!FITS) wgmma_fence();
     }
     const uint32_t* a = activations + 4 * chunk;
     Wgmma<COLUMNS>::multiply(sums, a[0], a[1], a[2], a[3],
@@ -262,29 +316,33 @@ __device__ __forceinline__ void keep_order() { asm volatile("pmevent 0;" ::: "me
 
 // The consumers take turns at the tensor cores. Those that shared them would also finish
 // together, and leave them idle together.
+template <int TILES>
 __device__ __forceinline__ void begin_turn(int consumer) {
-  asm volatile("bar.sync %0, 256;" ::"r"(CONSUMERS + 1 + consumer) : "memory");
+  if constexpr (FITS && TILES == 2)
+    asm volatile("bar.sync %0, 256;" ::"r"(CONSUMERS + 1 + consumer) : "memory");
 }
 
+template <int TILES>
 __device__ __forceinline__ void pass_turn(int consumer) {
-  asm volatile("bar.arrive %0, 256;" ::"r"(2 * CONSUMERS - consumer) : "memory");
+  if constexpr (FITS && TILES == 2)
+    asm volatile("bar.arrive %0, 256;" ::"r"(2 * CONSUMERS - consumer) : "memory");
 }
 
 // One hidden layer. While the right half of its products runs, the left half goes
 // through swish.
-template <int CHUNKS, int LEFT_STREAMED, int RIGHT_STREAMED, int REGISTERS>
+template <int TILES, int CHUNKS, int LEFT_STREAMED, int RIGHT_STREAMED, int REGISTERS>
 __device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
                                              const uint32_t (&operand)[REGISTERS],
                                              const __half* resident, Shared& smem,
                                              Cursor& cursor, int pair, int consumer) {
   constexpr int RESIDENT_LEFT = (CHUNKS - LEFT_STREAMED) * DEPTH * LEFT;
   float left[LEFT / 2], right[RIGHT / 2];
-  begin_turn(consumer);
+  begin_turn<TILES>(consumer);
   const int left_slot =
       multiply<CHUNKS, LEFT, LEFT_STREAMED>(left, operand, resident, smem, cursor);
   const int right_slot = multiply<CHUNKS, RIGHT, RIGHT_STREAMED>(
       right, operand, resident + RESIDENT_LEFT, smem, cursor);
-  pass_turn(consumer);
+  pass_turn<TILES>(consumer);
   finish<1>(left);
   if (LEFT_STREAMED > 0) release(smem, left_slot);
   swish(left);
@@ -373,7 +431,8 @@ __device__ __forceinline__ void draw_targets(float* target, const float (&head)[
   }
 }
 
-__device__ void consume(Shared& smem, const Rollout& rollout, int member, int first_row,
+template <int TILES>
+__device__ void consume(Shared& smem, const Rollout& rollout, const Block& block,
                         int consumer, int thread) {
   // A warp has 16 particles from beginning to end.
   constexpr int WARP_ROWS = TILE / 4;
@@ -423,10 +482,11 @@ __device__ void consume(Shared& smem, const Rollout& rollout, int member, int fi
   }
   if (owns_state) {
     const int rows = rollout.num_candidates * rollout.particles;
-    const int wanted = first_row + consumer * TILE + row;
+    const int wanted = block.first_row + consumer * TILE + row;
     const int particle = min(wanted, rows - 1);
     const int candidate = particle / rollout.particles;
-    const int in_step = (member * rollout.particles + particle % rollout.particles) * OBS;
+    const int in_step =
+        (block.member * rollout.particles + particle % rollout.particles) * OBS;
     smem.path_offset[consumer][row] =
         wanted < rows ? candidate * (rollout.horizon + 1) * step_stride + in_step : -1;
     smem.action_offset[consumer][row] = candidate * rollout.horizon * ACTION;
@@ -443,7 +503,7 @@ __device__ void consume(Shared& smem, const Rollout& rollout, int member, int fi
   write_actions();
   sync_warpgroup(consumer);
   wait(&smem.resident_full, 0);
-  if (consumer == 1) pass_turn(consumer);  // the other one is first
+  if (consumer == 1) pass_turn<TILES>(consumer);  // the other one is first
 
   Cursor cursor;
   for (int step = 0; step < rollout.horizon; ++step) {
@@ -460,12 +520,12 @@ __device__ void consume(Shared& smem, const Rollout& rollout, int member, int fi
               from + i % 2 * 8 * INPUT_STRIDE + i / 2 * 8 + chunk * DEPTH);
       }
       __syncwarp();
-      hidden_layer<INPUT_CHUNKS, 0, 0>(activations, operand, smem.resident, smem, cursor,
-                                       pair, consumer);
+      hidden_layer<TILES, INPUT_CHUNKS, 0, 0>(activations, operand, smem.resident, smem,
+                                              cursor, pair, consumer);
       const __half* resident = smem.resident + RESIDENT_INPUT;
 #pragma unroll 1
       for (int layer = 1; layer < LAYERS; ++layer) {
-        hidden_layer<HIDDEN_CHUNKS, LEFT_STREAMED, RIGHT_STREAMED>(
+        hidden_layer<TILES, HIDDEN_CHUNKS, LEFT_STREAMED, RIGHT_STREAMED>(
             activations, activations, resident, smem, cursor, pair, consumer);
         resident += RESIDENT_HIDDEN;
       }
@@ -497,17 +557,18 @@ __device__ void consume(Shared& smem, const Rollout& rollout, int member, int fi
 }
 
 __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
-    const __grid_constant__ Rollout whole) {
+    const __grid_constant__ Rollout whole, const Split split) {
   extern __shared__ __align__(128) uint8_t bytes[];
   Shared& smem = *reinterpret_cast<Shared*>(bytes);
-  const int member = blockIdx.y, first_row = blockIdx.x * CONSUMERS * TILE;
-  const Rollout rollout = at_batch(whole, blockIdx.z);
-  const uint16_t* weights = rollout.weights + int64_t(member) * MEMBER_WEIGHTS;
+  const Block block = find_block(whole, split, blockIdx.x);
+  if (block.tiles < 1) return;
+  const Rollout rollout = at_batch(whole, block.batch);
+  const uint16_t* weights = rollout.weights + int64_t(block.member) * MEMBER_WEIGHTS;
   if (threadIdx.x == 0) {
     init_barrier(&smem.resident_full, 1);
     for (int slot = 0; slot < SLOTS; ++slot) {
       init_barrier(&smem.ring_full[slot], 1);
-      init_barrier(&smem.ring_empty[slot], CONSUMERS * WARPGROUP / 32);
+      init_barrier(&smem.ring_empty[slot], block.tiles * WARPGROUP / 32);
     }
     for (int consumer = 0; consumer < CONSUMERS; ++consumer) {
       init_barrier(&smem.noise_full[consumer], NOISE_WARPS);
@@ -523,12 +584,15 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
   if (warpgroup == CONSUMERS) {
     asm volatile("setmaxnreg.dec.sync.aligned.u32 56;");
     if (thread >= 32)
-      draw_noise(smem, rollout, member, first_row, thread - 32);
+      draw_noise(smem, rollout, block, thread - 32);
     else if (thread == 0)
       feed_weights(smem, weights, rollout.horizon);
   } else {
     asm volatile("setmaxnreg.inc.sync.aligned.u32 224;");
-    consume(smem, rollout, member, first_row, warpgroup, thread);
+    if (block.tiles == 2)
+      consume<2>(smem, rollout, block, warpgroup, thread);
+    else if (warpgroup == 0)
+      consume<1>(smem, rollout, block, warpgroup, thread);
   }
 }
 
@@ -540,13 +604,18 @@ ffi::Error run(cudaStream_t stream, ffi::AnyBuffer weights,
   const Rollout& rollout = problem.rollout;
   constexpr size_t size = sizeof(Shared);
   static_assert(size <= 232448, "a block's shared memory is too small for this model");
-  const int rows = rollout.num_candidates * rollout.particles;
-  const dim3 grid((rows + CONSUMERS * TILE - 1) / (CONSUMERS * TILE), rollout.num_members,
-                  rollout.batch);
-  cudaError_t error = cudaFuncSetAttribute(
-      rollout_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, size);
+  int device = 0, multiprocessors = 1;
+  cudaError_t error = cudaGetDevice(&device);
+  if (error == cudaSuccess)
+    error = cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount,
+                                   device);
+  if (error == cudaSuccess)
+    error = cudaFuncSetAttribute(rollout_kernel,
+                                 cudaFuncAttributeMaxDynamicSharedMemorySize, size);
   if (error == cudaSuccess) {
-    rollout_kernel<<<grid, THREADS, size, stream>>>(rollout);
+    const Split split = split_up(rollout, multiprocessors);
+    rollout_kernel<<<split.whole + 2 * split.halved, THREADS, size, stream>>>(rollout,
+                                                                              split);
     error = cudaGetLastError();
   }
   return error == cudaSuccess ? ffi::Error::Success()
