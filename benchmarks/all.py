@@ -11,8 +11,11 @@ SET = (
     (plan, "--precision f32 --seeds 1"),
     (fit, "--seeds 1 4 16"),
     (rollout, "--precision bf16 tf32 f32"),
-    (env, "--batch 1 256"),
-    (plan, "--engine scan kernel --seeds 1 4 16"),  # last: it ends where no kernel runs
+    (env, "--batch 1 4 16 64 256 4096"),
+    # Last: these end where no kernel runs.
+    (plan, "--engine scan kernel --seeds 1 4 16"),
+    (plan, "--engine scan kernel --seeds 1 4 16 --plans 10"),
+    (plan, "--engine kernel --seeds 1 --num-samples 125 250 1000 2000 4000 8000"),
 )
 
 

@@ -63,6 +63,7 @@ def plans(rows: Iterable[Row]) -> list[Row]:
         if row["benchmark"] == "plan"
         and row["sizes"].items() >= rest.items()
         and not row["sizes"].get("chunk_size")
+        and row["sizes"].get("plans", 1) == 1
     ]
     devices = sorted({row["device"] for row in found})
     if len(devices) != 1:

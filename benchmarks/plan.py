@@ -1,6 +1,8 @@
 """Time of one action of model-predictive control, over precision and seeds.
 
-Each seed has its own model; the time of a row is that of all its seeds together.
+Each seed has its own model; the time of a row is that of all its seeds together. With
+`--plans 10` a call makes ten plans one after the other, as acting does: what a call
+costs the host is then shared.
 
 With `--gemm`, `gemm_fraction` is the rate of the plan's matrix products over that of
 bare ones in the same precision, `f32_gemm_fraction` over that of bare ones in float32:
@@ -23,8 +25,8 @@ from benchmarks import rows, timing, workloads
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (
-    "engine", "precision", "seeds", "num_samples", "horizon", "compile_s", "min_ms",
-    "median_ms", "ms_per_plan", "tflops_per_s", "gemm_fraction",
+    "engine", "precision", "seeds", "plans", "num_samples", "horizon", "compile_s",
+    "min_ms", "median_ms", "ms_per_plan", "tflops_per_s", "gemm_fraction",
 )  # fmt: skip
 
 
@@ -58,15 +60,18 @@ def measure(
 
     params, state, obs = prepare(keys)
     inputs = (params, keys, state, obs)
-    step, compile_s = timing.compile_program(jax.vmap(planner.step), *inputs)
+    program = in_turn(planner, args.plans) if args.plans > 1 else planner.step
+    step, compile_s = timing.compile_program(jax.vmap(program), *inputs)
     call = functools.partial(step, *inputs)
     result = timing.repeat(call, compile_s, repeats=args.repeats)
     candidates = workloads.candidates_per_action(size, args.optimizer)
-    flops = seeds * workloads.rollout_flops(size, candidates)
+    plans = seeds * args.plans
+    flops = plans * workloads.rollout_flops(size, candidates)
     sizes = {
         **dataclasses.asdict(size),
         "precision": precision,
         "seeds": seeds,
+        "plans": args.plans,
         "optimizer": args.optimizer,
         "reward": args.reward,
         "chunk_size": args.chunk_size,
@@ -80,12 +85,25 @@ def measure(
         dtype=precision,
         seeds=seeds,
         engine=engine,
-        ms_per_plan=result.median_ms / seeds,
+        ms_per_plan=result.median_ms / plans,
         **result._asdict(),
         gflop=flops / 1e9,
         tflops_per_s=flops / result.median_ms / 1e9,
         **beside,
     )
+
+
+def in_turn(planner: jaxpets.Planner, plans: int) -> Callable[..., Any]:
+    """Returns a program that makes so many plans one after the other."""
+
+    def run(params: Any, key: jax.Array, state: Any, obs: jax.Array) -> Any:
+        def step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            out, state = planner.step(params, key, state, obs)
+            return state, out.action
+
+        return jax.lax.scan(step, state, jax.random.split(key, plans))
+
+    return run
 
 
 def beside_gemm(
@@ -123,6 +141,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--engine", nargs="+", choices=workloads.ENGINES,
                         default=["scan"], help="what imagines")  # fmt: skip
     parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1, 4, 16])
+    parser.add_argument("--plans", type=rows.positive, default=1, help="of one call")
     parser.add_argument("--num-samples", nargs="+", type=rows.positive)
     parser.add_argument("--horizon", nargs="+", type=rows.positive)
     parser.add_argument("--optimizer", choices=workloads.OPTIMIZERS, default="cem")

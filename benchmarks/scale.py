@@ -23,7 +23,7 @@ from benchmarks import rows, timing, workloads
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (
-    "benchmark", "devices", "num_samples", "compile_s", "one_ms", "all_ms",
+    "benchmark", "engine", "devices", "num_samples", "compile_s", "one_ms", "all_ms",
     "efficiency", "difference",
 )  # fmt: skip
 AXIS = "device"
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def seeds(size: workloads.Size, count: int, args: argparse.Namespace) -> dict[str, Any]:
     """Compares `count` seeds on as many devices with one seed on one."""
-    planner = workloads.planner(size, args.precision)
+    planner = workloads.planner(size, args.precision, engine=args.engine)
     mesh = _mesh(count)
     inputs = jax.jit(jax.vmap(_prepared(size, planner)))(
         jax.random.split(jax.random.key(0), count)
@@ -67,7 +67,7 @@ def candidates(
     size: workloads.Size, count: int, args: argparse.Namespace
 ) -> dict[str, Any]:
     """Compares one plan over `count` devices with the plan on one."""
-    rollout = workloads.rollout_fn(size, args.precision)
+    rollout = workloads.rollout_fn(size, args.precision, args.engine)
     search = workloads.optimizer(size, "cem")
     whole = jaxpets.plan(rollout, jaxpets.rewards.epistemic, search)
     parted = jaxpets.plan(
@@ -99,7 +99,12 @@ def _row(
     result = timing.compare(one, every, repeats=args.repeats)
     return rows.make_row(
         name,
-        {**dataclasses.asdict(size), "precision": args.precision, "devices": count},
+        {
+            **dataclasses.asdict(size),
+            "precision": args.precision,
+            "engine": args.engine,
+            "devices": count,
+        },
         compile_s=compile_s,
         one_ms=result.first_ms,
         all_ms=result.second_ms,
@@ -145,6 +150,9 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
         help="how many; those that are not there are left out",
     )  # fmt: skip
     parser.add_argument("--precision", choices=workloads.PRECISIONS, default="bf16")
+    parser.add_argument(
+        "--engine", choices=workloads.ENGINES, default="scan", help="what imagines"
+    )
     parser.add_argument(
         "--num-samples", type=rows.positive, help="of the large plan; default 16 plans"
     )

@@ -51,6 +51,7 @@ ROWS = [
     row(1.0, horizon=15),
     row(1.0, hidden_sizes=[64, 64]),
     row(1.0, chunk_size=50),
+    row(1.0, plans=10),
     row(1.0, benchmark="rollout"),
     row(1.0, seeds=4, num_samples=125),
 ]

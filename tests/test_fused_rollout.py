@@ -701,3 +701,21 @@ def test_the_kernel_equals_the_scan(name):
         one = jax.jit(mapped)(*many)[1, 2, 1, 2]
         last = [jax.tree.map(lambda x: x[-1], arg) for arg in many]
         np.testing.assert_array_equal(one, jax.jit(fused)(*last))
+
+
+# Weights that stay in shared memory; that stream through a ring which holds a layer, or
+# does not; candidates for blocks of one tile, and for blocks of both kinds.
+@pytest.mark.gpu
+@pytest.mark.parametrize("num_samples", [70, 1000])
+@pytest.mark.parametrize(
+    "hidden_sizes", [(64,), (200,) * 4, (208,) * 4, (256,) * 4, (128,) * 8]
+)
+def test_the_kernel_equals_the_scan_at_every_width(hidden_sizes, num_samples):
+    case = dataclasses.replace(
+        CHEETAH, hidden_sizes=hidden_sizes, num_samples=num_samples
+    )
+    with jax.default_device(jax.devices("gpu")[0]):
+        fused, caught = recorded(lambda: case.fused(interpret=False))
+        assert not caught
+        got, want = jax.jit(fused)(*case.args()), jax.jit(case.scan())(*case.args())
+        assert relative_error(got, want) <= 1e-3

@@ -13,6 +13,9 @@ from jaxpets._src.checks import check_count, check_key
 from jaxpets._src.ensemble import Ensemble, EnsembleParams, NetworkParams
 from jaxpets._src.types import Dataset
 
+# Updates between two looks at how many there are: a GPU's host waits for each.
+_UPDATES_AT_ONCE = 4
+
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig:
@@ -91,8 +94,10 @@ def fit(
 
     def update(
         network: NetworkParams, opt_state: Any, inputs: Array, targets: Array,
-        weight: Array,
+        used: Array,
     ) -> tuple[NetworkParams, Any, Array, Array]:  # fmt: skip
+        count = jnp.sum(used)
+        weight = used / jnp.maximum(count, 1.0)
         grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
         (loss, mse), grads = grad_fn(network, inputs, targets, weight)
         # Optimizers of optax do not trace under strict promotion, if a caller set it.
@@ -106,8 +111,9 @@ def fit(
         leaves = jax.tree.leaves(grads)
         ends = jnp.concatenate([leaves[0].ravel(), leaves[-1].ravel(), loss[None]])
         finite = jnp.all(jnp.isfinite(ends))
+        wanted = finite & (count > 0.0)
         network, opt_state = jax.tree.map(
-            lambda a, b: jnp.where(finite, a, b), (new, new_state), (network, opt_state)
+            lambda a, b: jnp.where(wanted, a, b), (new, new_state), (network, opt_state)
         )
         return network, opt_state, jnp.where(finite, loss, jnp.nan), mse
 
@@ -135,20 +141,27 @@ def fit(
                 position = i * batch_size + jnp.arange(batch_size, dtype=jnp.int32)
                 picked = jnp.take(rows, position, axis=1, mode="clip")
                 used = (position < size).astype(jnp.float32)
-                count = jnp.sum(used)
                 network, opt_state, loss, mse = update(
-                    network, opt_state, inputs[picked], targets[picked], used / count
+                    network, opt_state, inputs[picked], targets[picked], used
                 )
-                bad = jnp.logical_not(jnp.isfinite(loss))
-                share = count / size.astype(jnp.float32)
+                bad = jnp.logical_not(jnp.isfinite(loss)) & (i < num_batches)
+                share = jnp.sum(used) / size.astype(jnp.float32)
                 totals = jax.tree.map(
                     lambda t, x: t + jnp.where(bad, 0.0, x) * share, totals, (loss, mse)
                 )
                 return network, opt_state, skipped + bad.astype(jnp.int32), totals
 
+            def batches(i: Array, carry: tuple) -> tuple:
+                def one(j: Array, carry: tuple) -> tuple:
+                    return batch(i * _UPDATES_AT_ONCE + j, carry)
+
+                # Its length is known. The last ones may find no rows left.
+                return jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, carry)
+
             zero = jnp.zeros((), jnp.float32)
             carry = (network, opt_state, skipped, (zero, zero))
-            return jax.lax.fori_loop(0, num_batches, batch, carry), None
+            num_turns = (num_batches + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
+            return jax.lax.fori_loop(0, num_turns, batches, carry), None
 
         zero = jnp.zeros((), jnp.float32)
         carry = (

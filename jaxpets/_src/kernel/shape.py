@@ -3,8 +3,8 @@
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 # Of a block on an H100 or H200, without what CUDA keeps.
@@ -12,7 +12,8 @@ SHARED_MEMORY = 232_448
 _DEPTH = 16  # of one tensor core instruction
 _TILE = 64  # rows of one
 _MAX_COLUMNS = 256  # of one
-_UNIT = 4  # chunks that stream together
+# Chunks that stream together, and slots for them. Few large ones: each is waited for.
+_RINGS = ((6, 2), (4, 3), (4, 2))
 _HALF_MAX = 65504.0
 
 
@@ -68,18 +69,22 @@ class KernelShape:
         """Returns how to split the weights between shared memory and the ring.
 
         As much as fits stays in shared memory. The left halves of hidden layers stream
-        first: the right halves' products then never wait.
+        first: the right halves' products then never wait. A ring that takes all that
+        streams of a layer is preferred.
         """
         chunks = _chunks(self.width)
-        unit = min(_UNIT, chunks)
-        most = chunks // unit * unit
-        for slots in (3, 2):
-            for streamed in range(0, 2 * most + 1, unit):
-                left = min(streamed, most)
+        found = []
+        for most, slots in _RINGS:
+            unit = min(most, chunks)
+            half = chunks // unit * unit
+            for streamed in range(0, 2 * half + 1, unit):
+                left = min(streamed, half)
                 streaming = Streaming(left, streamed - left, unit, slots)
                 if self._shared_bytes(streaming) <= SHARED_MEMORY:
-                    return streaming
-        return None
+                    found.append(streaming)
+                    break
+        whole = [s for s in found if s.left + s.right <= s.unit * s.slots]
+        return (*whole, *found, None)[0]
 
     def _shared_bytes(self, streaming: "Streaming") -> int:
         inputs, hidden = _chunks(self.input_size), _chunks(self.width)
@@ -124,27 +129,37 @@ class KernelShape:
         Args:
           layers: `kernel` `[E, in, out]` and `bias` `[E, out]` of each, in order.
         """
-        *hidden, output = layers
-        # The kernel computes swish(2 h) = h + h tanh(h).
-        hidden = [jax.tree.map(lambda x: x / 2, layer) for layer in hidden]
-        rows = [self.input_size] + [self.width] * len(hidden)
-        blocks = []
-        for layer, size in zip(hidden, rows[:-1], strict=True):
+        halves = (slice(None, self.left), slice(self.left, None))
+        entries = np.arange(self.obs_size)
+        head = np.concatenate([entries, self.head + entries])  # means, log-variances
+        numbers, places = [jnp.zeros((layers[0]["bias"].shape[0], 1), jnp.float16)], []
+        count = 1
+        for i, layer in enumerate(layers):
+            is_head = i == len(layers) - 1
+            # The kernel computes swish(2 h) = h + h tanh(h).
             kernel, bias = (
-                _pad(layer[name], self.width) for name in ("kernel", "bias")
+                layer[name] if is_head else layer[name] / 2
+                for name in ("kernel", "bias")
             )
-            for half in (slice(None, self.left), slice(self.left, None)):
-                blocks.append(_blocks(kernel[..., half], bias[..., half], size))
-        means, raws = (
-            {name: _pad(part[..., half], self.head) for name, part in output.items()}
-            for half in (slice(None, self.obs_size), slice(self.obs_size, None))
-        )
-        kernel, bias = (
-            jnp.concatenate([means[name], raws[name]], axis=-1)
-            for name in ("kernel", "bias")
-        )
-        blocks.append(_blocks(kernel, bias, rows[-1]))
-        return jnp.concatenate(blocks, axis=-1)
+            rounded = _half(bias)
+            rest = _half(bias - rounded.astype(jnp.float32))
+            whole = [_half(kernel), rounded[:, None], rest[:, None]]
+            numbers += [part.reshape(part.shape[0], -1) for part in whole]
+            inner, columns = kernel.shape[1:]
+            place = count + np.arange((inner + 2) * columns).reshape(-1, columns)
+            count += place.size
+            # What is not the layer's is the first number, the zero.
+            rows = self.input_size if i == 0 else self.width
+            width = 2 * self.head if is_head else self.width
+            matrix = np.zeros((_DEPTH * _chunks(rows), width), np.int32)
+            at = head if is_head else np.arange(columns)
+            matrix[:inner, at] = place[:inner]
+            matrix[rows : rows + 2, at] = place[inner:]
+            parts = [matrix] if is_head else [matrix[:, half] for half in halves]
+            places += map(_blocks, parts)
+        flat = jnp.concatenate(numbers, axis=1)
+        index = np.concatenate(places)
+        return flat.at[:, index].get(mode="promise_in_bounds")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,27 +180,15 @@ def _chunks(rows: int) -> int:
     return math.ceil((rows + 2) / _DEPTH)  # two more for the bias
 
 
-def _pad(array: Array, size: int) -> Array:
-    """Pads the last axis with zeros."""
-    widths = [(0, 0)] * (array.ndim - 1) + [(0, size - array.shape[-1])]
-    return jnp.pad(array, widths)
+def _blocks(matrix: np.ndarray) -> np.ndarray:
+    """Lays out a layer, or half of one, as chunks of 16 rows, each as blocks of 8 x 8.
 
-
-def _blocks(kernel: Array, bias: Array, rows: int) -> Array:
-    """Lays a layer, or half of one, out as chunks of 16 rows, each as blocks of 8 x 8.
-
-    The bias stands below the `rows` rows, as float16 and, in the row after, what that
-    left. Order within a chunk: 8 columns, two halves of the rows, column, row.
+    The rows are those of the weights, then the bias as float16 and what that left.
+    Order within a chunk: 8 columns, two halves of the rows, column, row.
     """
-    kernel = _half(jnp.pad(kernel, ((0, 0), (0, rows - kernel.shape[1]), (0, 0))))
-    rounded = _half(bias)
-    rest = _half(bias - rounded.astype(jnp.float32))
-    whole = jnp.concatenate([kernel, rounded[:, None], rest[:, None]], axis=1)
-    members, _, columns = whole.shape
-    height = _DEPTH * _chunks(rows)
-    whole = jnp.pad(whole, ((0, 0), (0, height - rows - 2), (0, 0)))
-    whole = whole.reshape(members, height // _DEPTH, 2, 8, columns // 8, 8)
-    return whole.transpose(0, 1, 4, 2, 5, 3).reshape(members, -1)
+    height, columns = matrix.shape
+    matrix = matrix.reshape(height // _DEPTH, 2, 8, columns // 8, 8)
+    return matrix.transpose(0, 3, 1, 4, 2).ravel()
 
 
 def _half(array: Array) -> Array:
