@@ -243,17 +243,17 @@ __device__ __forceinline__ void release(Shared& smem, int slot) {
 }
 
 // Starts sums = activations x weights, as groups of products in flight. A slot of the
-// ring is handed back when the unit after it has been started; returns the last slot,
-// which the caller hands back, if any chunk streams.
-template <int CHUNKS, int COLUMNS, int STREAMED, int REGISTERS>
+// ring, or one left PENDING from before, is handed back when the unit after it has been
+// started: whoever waits for a slot holds only one. Returns the last slot, which the
+// caller hands back, if any chunk streams.
+template <int CHUNKS, int COLUMNS, int STREAMED, bool PENDING, int REGISTERS>
 __device__ __forceinline__ int multiply(float (&sums)[COLUMNS / 2],
                                         const uint32_t (&activations)[REGISTERS],
                                         const __half* resident, Shared& smem,
-                                        Cursor& cursor) {
+                                        Cursor& cursor, int pending = 0) {
   constexpr int RESIDENT = CHUNKS - STREAMED;
   constexpr int CHUNK_STRIDE = DEPTH * COLUMNS * 2 / 16;  // in units of descriptors
   uint64_t weights = weight_descriptor(address(resident));
-  int pending = -1;
   if constexpr (FITS) {
     // Now, not between the products: nvcc runs no two of them at once around a branch.
     Cursor ahead = cursor;
@@ -280,7 +280,7 @@ __device__ __forceinline__ int multiply(float (&sums)[COLUMNS / 2],
     if (chunk + 1 == RESIDENT) wgmma_commit();
     if (streamed && in_unit + 1 == UNIT) {
       wgmma_commit();
-      if (chunk >= RESIDENT + UNIT) {
+      if (PENDING || chunk >= RESIDENT + UNIT) {
         wgmma_wait<1>();
         release(smem, pending);
       }
@@ -339,12 +339,12 @@ __device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_
   float left[LEFT / 2], right[RIGHT / 2];
   begin_turn<TILES>(consumer);
   const int left_slot =
-      multiply<CHUNKS, LEFT, LEFT_STREAMED>(left, operand, resident, smem, cursor);
-  const int right_slot = multiply<CHUNKS, RIGHT, RIGHT_STREAMED>(
-      right, operand, resident + RESIDENT_LEFT, smem, cursor);
+      multiply<CHUNKS, LEFT, LEFT_STREAMED, false>(left, operand, resident, smem, cursor);
+  const int right_slot = multiply<CHUNKS, RIGHT, RIGHT_STREAMED, (LEFT_STREAMED > 0)>(
+      right, operand, resident + RESIDENT_LEFT, smem, cursor, left_slot);
   pass_turn<TILES>(consumer);
   finish<1>(left);
-  if (LEFT_STREAMED > 0) release(smem, left_slot);
+  if (LEFT_STREAMED > 0 && RIGHT_STREAMED == 0) release(smem, left_slot);
   swish(left);
   keep_order();
   finish<0>(right);
@@ -529,7 +529,8 @@ __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block
             activations, activations, resident, smem, cursor, pair, consumer);
         resident += RESIDENT_HIDDEN;
       }
-      multiply<HIDDEN_CHUNKS, 2 * HEAD, 0>(head, activations, resident, smem, cursor);
+      multiply<HIDDEN_CHUNKS, 2 * HEAD, 0, false>(head, activations, resident, smem,
+                                                  cursor);
       write_actions();
       store_states(step);
       keep_order();
