@@ -94,14 +94,15 @@ def measure(
 
 
 def in_turn(planner: jaxpets.Planner, plans: int) -> Callable[..., Any]:
-    """Returns a program that makes so many plans one after the other."""
+    """Returns a program of so many plans in turn; it returns their actions first."""
 
     def run(params: Any, key: jax.Array, state: Any, obs: jax.Array) -> Any:
         def step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             out, state = planner.step(params, key, state, obs)
             return state, out.action
 
-        return jax.lax.scan(step, state, jax.random.split(key, plans))
+        state, actions = jax.lax.scan(step, state, jax.random.split(key, plans))
+        return actions, state
 
     return run
 

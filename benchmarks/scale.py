@@ -4,6 +4,7 @@
 the latter over that of the former. `candidates`: one plan of many candidates, shared
 out over devices, beside the same plan on one; efficiency is the speed-up per device.
 `difference` is the largest, of any action, to the same plans computed on one device.
+With `--plans 10` a call makes ten plans one after the other, as acting does.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
-from benchmarks import rows, timing, workloads
+from benchmarks import plan, rows, timing, workloads
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (
@@ -49,17 +50,17 @@ def seeds(size: workloads.Size, count: int, args: argparse.Namespace) -> dict[st
         jax.random.split(jax.random.key(0), count)
     )
     each = [jax.tree.map(lambda x, i=i: x[i : i + 1], inputs) for i in range(count)]
-    step = jax.vmap(planner.step)
+    step = jax.vmap(plan.in_turn(planner, args.plans))
     one, _ = timing.compile_program(step, *each[0])
     spread = _over(mesh, step, P(AXIS), P(AXIS))
     inputs = jax.device_put(inputs, NamedSharding(mesh, P(AXIS)))
     every, compile_s = timing.compile_program(spread, *inputs)
-    alone = np.concatenate([one(*own)[0].action for own in each])
+    alone = np.concatenate([one(*own)[0] for own in each])
     return _row(
         "scale-seeds", size, count, args, compile_s,
         one=lambda: one(*each[0]),
         every=lambda: every(*inputs),
-        difference=np.abs(np.asarray(every(*inputs)[0].action) - alone).max(),
+        difference=np.abs(np.asarray(every(*inputs)[0]) - alone).max(),
     )  # fmt: skip
 
 
@@ -74,19 +75,20 @@ def candidates(
         rollout, jaxpets.rewards.epistemic, jaxpets.sharded(search, AXIS)
     )
     inputs = jax.jit(_prepared(size, whole))(jax.random.key(0))
-    one, _ = timing.compile_program(whole.step, *inputs)
+    one, _ = timing.compile_program(plan.in_turn(whole, args.plans), *inputs)
     mesh = _mesh(count)
     placed = jax.device_put(inputs, NamedSharding(mesh, P()))
-    spread = _over(mesh, parted.step, P(), P())
+    part = plan.in_turn(parted, args.plans)
+    spread = _over(mesh, part, P(), P())
     every, compile_s = timing.compile_program(spread, *placed)
     # The same parts, with the same draws, on one device: an axis of vmap.
-    parts = jax.vmap(lambda _: parted.step(*inputs), axis_name=AXIS)
-    same = jax.jit(parts)(jnp.arange(count))[0].action[0]
+    parts = jax.vmap(lambda _: part(*inputs), axis_name=AXIS)
+    same = jax.jit(parts)(jnp.arange(count))[0][0]
     return _row(
         "scale-candidates", size, count, args, compile_s,
         one=lambda: one(*inputs),
         every=lambda: every(*placed),
-        difference=np.abs(np.asarray(every(*placed)[0].action) - same).max(),
+        difference=np.abs(np.asarray(every(*placed)[0]) - same).max(),
         parts=count,
     )  # fmt: skip
 
@@ -103,6 +105,7 @@ def _row(
             **dataclasses.asdict(size),
             "precision": args.precision,
             "engine": args.engine,
+            "plans": args.plans,
             "devices": count,
         },
         compile_s=compile_s,
@@ -153,6 +156,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--engine", choices=workloads.ENGINES, default="scan", help="what imagines"
     )
+    parser.add_argument("--plans", type=rows.positive, default=1, help="of one call")
     parser.add_argument(
         "--num-samples", type=rows.positive, help="of the large plan; default 16 plans"
     )

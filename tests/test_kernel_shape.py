@@ -224,3 +224,70 @@ def test_one_instruction_for_each_width_of_products(name):
         ]
         operands = sorted({int(i) for i in re.findall(r"%(\d+)", body)})
         assert operands == list(range(width // 2 + 6))  # a0 to a3, weights, add
+
+
+def consumer(streaming, layers, steps):
+    """What a consumer of rollout.cu does with the ring and its turns, in order."""
+    fits = streaming.left + streaming.right <= streaming.unit * streaming.slots
+    done, unit = [], 0
+    for _ in range(steps):
+        done += ["begin", "pass"]  # the input layer streams nothing
+        for _ in range(layers - 1):
+            done.append("begin")
+            pending = None
+            for half in (streaming.left, streaming.right):
+                units = range(unit, unit + half // streaming.unit)
+                if fits:
+                    done += [("wait", u) for u in units]
+                for u in units:
+                    done += [] if fits else [("wait", u)]
+                    done += [] if pending is None else [("release", pending)]
+                    pending = u
+                unit = units.stop
+            done.append("pass")
+            done += [] if pending is None else [("release", pending)]
+    return done, unit, fits
+
+
+def finishes(streaming, layers, tiles, steps=3):
+    """Whether consumers and producer all come to their end."""
+    program, num_units, fits = consumer(streaming, layers, steps)
+    at, fed = [0] * tiles, 0
+    released = [set() for _ in range(tiles)]
+    passed, begun = [0, 1], [0, 0]  # consumer 1 passes its first turn
+    while min(at) < len(program):
+        before = fed, list(at)
+        free = all(fed - streaming.slots in r for r in released)
+        if fed < num_units and (fed < streaming.slots or free):
+            fed += 1
+        for c in range(tiles):
+            step = program[at[c]] if at[c] < len(program) else ("wait", num_units)
+            if step == "begin" and fits and tiles == 2:
+                if passed[1 - c] <= begun[c]:
+                    continue
+                begun[c] += 1
+            elif step == "pass":
+                passed[c] += 1
+            elif step[0] == "release":
+                released[c].add(step[1])
+            elif step[0] == "wait" and step[1] >= fed:
+                continue
+            at[c] += 1
+        if before == (fed, at):
+            return False
+    return True
+
+
+def test_consumers_and_producer_never_wait_for_each_other():
+    seen = set()
+    for width in range(8, 257, 8):
+        for layers in (1, 2, 4, 8):
+            streaming = KernelShape(18, 6, 18, (width,) * layers).streaming()
+            if streaming is None:
+                continue
+            assert finishes(streaming, layers, tiles=1)
+            assert finishes(streaming, layers, tiles=2)
+            seen.add(streaming)
+    assert len(seen) > 10
+    # One slot is too few: a consumer hands a unit back when the next one has begun.
+    assert not finishes(dataclasses.replace(PAPER.streaming(), slots=1), 4, tiles=2)
