@@ -93,6 +93,7 @@ def restore(
     template: Any,
     *,
     step: int | None = None,
+    part: bool = False,
     warn: Callable[[str], None],
 ) -> tuple[int, Any, dict[str, Any]] | None:
     """Reads the newest step that is undamaged, or exactly `step`.
@@ -104,6 +105,7 @@ def restore(
       directory: As in `save`.
       template: The state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device.
       step: The one to read, or None for the newest.
+      part: Whether the template may be a part of what was saved, with the same paths.
       warn: Gets each warning as one line.
 
     Returns:
@@ -119,7 +121,7 @@ def restore(
     damaged = {}
     for number in candidates:
         try:
-            state, meta = _read(directory, number, template)
+            state, meta = _read(directory, number, template, part)
         except _DamagedError as error:
             damaged[number] = str(error)
             continue
@@ -190,6 +192,8 @@ def _commit(
     )
     with _quiet_orbax() as orbax:
         orbax.save(draft, args=items)
+    for note in draft.rglob("commit_success.txt"):
+        note.write_text("whole\n")  # orbax says there where on this machine it wrote
     seal(draft)
     _read_arrays(draft, _read_manifest(draft, step))
     sync_tree(draft)
@@ -226,12 +230,14 @@ def _disk_message(
 # Reading.
 
 
-def _read(directory: Path, number: int, template: Any) -> tuple[Any, dict[str, Any]]:
+def _read(
+    directory: Path, number: int, template: Any, part: bool
+) -> tuple[Any, dict[str, Any]]:
     """Reads and checks one step; raises CheckpointError if it does not fit."""
     folder = directory / str(number)
     try:
         body = _read_manifest(folder, number)
-        if why := misfit(body, describe(template)):
+        if why := misfit(body, describe(template), part=part):
             raise CheckpointError(f"checkpoint {number} in {directory} {why}")
         arrays = _read_arrays(folder, body)
     except PermissionError as error:

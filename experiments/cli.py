@@ -16,6 +16,8 @@ from experiments.config import PRESETS, Config, ranges, validate
 from experiments.errors import CheckpointError, UsageError
 from experiments.hosts import Place
 
+# Explored models that come with the code; see `experiments.pretrained`.
+PRETRAINED = Path(__file__).parents[1] / "results" / "pretrained"
 # What belongs to a process and not to its run.
 _PLACE = Place._fields
 # Where a run that is continued may differ from its start.
@@ -68,7 +70,22 @@ def place(argv: Sequence[str]) -> Place | None:
 def explored_run(config: Config) -> Path:
     """Returns the folder of the exploration run that a config speaks of."""
     name = config.name or f"{config.preset}-{config.arm}"
-    return (config.source or config.out / name).resolve()
+    return _found(config.source or config.out / name).resolve()
+
+
+def results_folder(config: Config) -> Path:
+    """Returns where later phases put theirs: the run they start from, if it is ours."""
+    source = explored_run(config)
+    if source.parent != PRETRAINED.resolve():
+        return source
+    return config.out.resolve() / f"pretrained-{source.name}"
+
+
+def _found(source: Path) -> Path:
+    """Returns a folder, or what comes with the code by the name `pretrained/NAME`."""
+    if source.exists() or source.parts[:1] != ("pretrained",):
+        return source
+    return PRETRAINED.joinpath(*(source.parts[1:] or ("epistemic",)))
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -199,7 +216,7 @@ def _joined(argv: Sequence[str]) -> list[str]:
 def _explored(first: argparse.Namespace, default: Config) -> Config:
     """Returns the defaults that an exploration run gives to a later phase."""
     name = first.name or f"{first.preset}-{first.arm}"
-    folder = Path(getattr(first, "from") or Path(first.out) / name)
+    folder = _found(Path(getattr(first, "from") or Path(first.out) / name))
     path = folder / "config.json"
     if not path.is_file():
         raise CheckpointError(

@@ -86,15 +86,17 @@ def _write(
 
 
 def restore(
-    directory: Path, template: State, say: Say, step: int | None = None
-) -> tuple[int, State, dict[str, Any]] | None:
+    directory: Path, template: Any, say: Say, step: int | None = None, *,
+    part: bool = False,
+) -> tuple[int, Any, dict[str, Any]] | None:  # fmt: skip
     """Restores on the first host, for all of them; see `checkpoint.restore`."""
     kept = []
 
     def read() -> tuple[int, dict[str, Any]] | None:
         found = checkpoint.restore(
-            directory, template, step=step, warn=lambda line: say(f"warning: {line}")
-        )
+            directory, template, step=step, part=part,
+            warn=lambda line: say(f"warning: {line}"),
+        )  # fmt: skip
         if found is None:
             return None
         number, state, meta = found

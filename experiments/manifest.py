@@ -51,15 +51,26 @@ def stored_leaves(body: Mapping[str, Any]) -> dict[str, Leaf]:
     }
 
 
-def misfit(body: Mapping[str, Any], wanted: Mapping[str, Leaf]) -> str | None:
-    """Says in one line why a record does not fit the wanted leaves, or returns None."""
+def misfit(
+    body: Mapping[str, Any], wanted: Mapping[str, Leaf], *, part: bool = False
+) -> str | None:
+    """Says in one line why a record does not fit the wanted leaves, or returns None.
+
+    Args:
+      body: the record.
+      wanted: leaves by path.
+      part: whether the record may have leaves beside the wanted ones.
+    """
     writer = f"written by jaxpets {body['jaxpets']}, schema {body['schema']}"
     if body["schema"] != SCHEMA:
         return (
             f"cannot be read ({writer}; this is jaxpets {jaxpets.__version__}, schema "
             f"{SCHEMA}). Use the version that wrote it."
         )
-    lines = _differences(stored_leaves(body), wanted)
+    stored = stored_leaves(body)
+    if part:
+        stored = {name: leaf for name, leaf in stored.items() if name in wanted}
+    lines = _differences(stored, wanted)
     if not lines:
         return None
     more = f"; and {len(lines) - 3} more" if len(lines) > 3 else ""

@@ -77,7 +77,7 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
         say(f"already complete: {config.eval_trials} of {config.eval_trials} trials.")
         return
     parts = build(config)
-    state = _explored(config, source, step, parts, say)
+    model = _explored(config, source, step, parts, say, only_model=True)
     names, weights = _tasks(config)
     spread = _spread(say, len(config.seeds), len(names), config.eval_trials)
     actors = acting.performers(
@@ -87,7 +87,7 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
     keys = _fan(trial_keys(config, ZERO_SHOT, step), _task_ids(names))
     keys = _fan(keys, range(config.eval_trials))
     params = jaxpets.PlanParams(
-        devices.place(spread, state.params, SEED), devices.place(spread, weights, TASK)
+        devices.place(spread, model.params, SEED), devices.place(spread, weights, TASK)
     )
     num_chunks = config.task_length // config.chunk_length
     progress = Progress(config.task_length, 0, "zero-shot")
@@ -164,14 +164,31 @@ def _spread(say: Say, *counts: int) -> Spread:
     return spread
 
 
-def _explored(config: Config, source: Path, step: int, parts: Parts, say: Say) -> State:
-    """Restores the learner `[S]` of an exploration run after trial `step`."""
-    keys = trial_keys(config, EXPLORE, 0)
-    init = jax.vmap(parts.learner.init, out_axes=LEARNER_AXES)
-    template = jax.eval_shape(init, keys)
-    found = loop.restore(source / "checkpoints", template, say, step)
+def _explored(
+    config: Config, source: Path, step: int, parts: Parts, say: Say, *,
+    only_model: bool = False,
+) -> State:  # fmt: skip
+    """Restores the learner `[S]` of an exploration run after trial `step`.
+
+    With `only_model` all but the model may be missing there, and is here.
+    """
+    template = explored_template(config, parts)
+    if only_model:
+        template = model_of(template)
+    found = loop.restore(source / "checkpoints", template, say, step, part=only_model)
     assert found is not None
     return found[1]
+
+
+def explored_template(config: Config, parts: Parts) -> State:
+    """Returns what exploration saves, `[S]`, as shapes."""
+    init = jax.vmap(parts.learner.init, out_axes=LEARNER_AXES)
+    return jax.eval_shape(init, trial_keys(config, EXPLORE, 0))
+
+
+def model_of(state: State) -> State:
+    """Returns what planning needs of a learner, with nothing in the other places."""
+    return jax.tree.map(lambda _: None, state)._replace(params=state.params)
 
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:

@@ -55,7 +55,7 @@ def _dispatch(config: Config) -> None:
         _explore(config, source)
         return
     step = hosts.on_first(lambda: _explored_step(config, source))
-    folder = source / f"{config.phase}-{step:03d}"
+    folder = cli.results_folder(config) / f"{config.phase}-{step:03d}"
     if config.task != "all":
         folder = folder.with_name(f"{folder.name}-{config.task}")
     with _without_gl(), _opened(config, folder):
