@@ -1,12 +1,13 @@
 // A whole particle rollout in one kernel.
 //
 // A block owns 128 particles of one member for all H steps. Two consumer warpgroups take
-// a tile of 64 each; where multiprocessors would idle, blocks own one tile. Their activations stay in registers: the accumulators of one layer, through
-// swish, are the left operand of the next layer's products, and only weights come from
-// shared memory. While one warpgroup rounds and squashes, the other keeps the tensor
-// cores busy. A member's weights do not fit into shared memory: as many chunks as do
-// stay there, the others stream from L2 through a ring, every step anew. The producer
-// warpgroup feeds the ring and draws the noise.
+// a tile of 64 each; where multiprocessors would idle, blocks own one tile. Activations
+// stay in registers: the accumulators of one layer, through swish, are the left operand
+// of the next layer's products, and only weights come from shared memory. While one
+// warpgroup rounds and squashes, the other keeps the tensor cores busy. A member's weights
+// do not fit into shared memory: as many chunks as do stay there, the others stream from
+// L2 through a ring, every step anew. The producer warpgroup feeds the ring and draws the
+// noise.
 //
 // Operands are float16: as fast as bfloat16, with three more bits. Sums, the head, the
 // state and its update are float32.
