@@ -1,4 +1,7 @@
-"""Whole runs of the preset smoke: real physics, real planning, real processes."""
+"""Whole runs of the preset smoke: real physics, real planning, real processes.
+
+Physics in C, which compiles in a third of the time; CI also runs every phase on MJX.
+"""
 
 import json
 import os
@@ -17,7 +20,7 @@ from experiments.build import EXPLORE, LEARNER_AXES, build, trial_keys
 from experiments.run import main
 from jaxpets.envs import half_cheetah
 
-SMOKE = ("--phase", "explore", "--preset", "smoke")
+SMOKE = ("--phase", "explore", "--preset", "smoke", "--engine", "mujoco")
 NAME = "smoke-epistemic"
 TRIAL, STEPS = 3, 20
 FIT = {
