@@ -94,10 +94,8 @@ def fit(
 
     def update(
         network: NetworkParams, opt_state: Any, inputs: Array, targets: Array,
-        used: Array,
+        weight: Array, has_rows: Array,
     ) -> tuple[NetworkParams, Any, Array, Array]:  # fmt: skip
-        count = jnp.sum(used)
-        weight = used / jnp.maximum(count, 1.0)
         grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
         (loss, mse), grads = grad_fn(network, inputs, targets, weight)
         # Optimizers of optax do not trace under strict promotion, if a caller set it.
@@ -111,9 +109,9 @@ def fit(
         leaves = jax.tree.leaves(grads)
         ends = jnp.concatenate([leaves[0].ravel(), leaves[-1].ravel(), loss[None]])
         finite = jnp.all(jnp.isfinite(ends))
-        wanted = finite & (count > 0.0)
+        kept = finite & has_rows
         network, opt_state = jax.tree.map(
-            lambda a, b: jnp.where(wanted, a, b), (new, new_state), (network, opt_state)
+            lambda a, b: jnp.where(kept, a, b), (new, new_state), (network, opt_state)
         )
         return network, opt_state, jnp.where(finite, loss, jnp.nan), mse
 
@@ -141,11 +139,14 @@ def fit(
                 position = i * batch_size + jnp.arange(batch_size, dtype=jnp.int32)
                 picked = jnp.take(rows, position, axis=1, mode="clip")
                 used = (position < size).astype(jnp.float32)
+                count = jnp.sum(used)
+                has_rows = count > 0.0
                 network, opt_state, loss, mse = update(
-                    network, opt_state, inputs[picked], targets[picked], used
-                )
-                bad = jnp.logical_not(jnp.isfinite(loss)) & (i < num_batches)
-                share = jnp.sum(used) / size.astype(jnp.float32)
+                    network, opt_state, inputs[picked], targets[picked],
+                    used / jnp.maximum(count, 1.0), has_rows,
+                )  # fmt: skip
+                bad = jnp.logical_not(jnp.isfinite(loss)) & has_rows
+                share = count / size.astype(jnp.float32)
                 totals = jax.tree.map(
                     lambda t, x: t + jnp.where(bad, 0.0, x) * share, totals, (loss, mse)
                 )
