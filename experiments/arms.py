@@ -7,6 +7,7 @@ from jax import Array
 
 import jaxpets
 from experiments.config import Config
+from jaxpets._src.moments import moments
 from jaxpets.envs import half_cheetah
 
 
@@ -34,6 +35,9 @@ def make_arm(config: Config, model: jaxpets.Ensemble) -> Arm:
         "random": lambda config, model: Arm(None, NO_DATA),
         "oracle": _oracle,
         "one-step": _one_step,
+        "info-gain": _info_gain,
+        "scaled": _scaled,
+        "scaled-log": _scaled_log,
     }[config.arm](config, model)
 
 
@@ -83,3 +87,31 @@ def _one_step(config: Config, model: jaxpets.Ensemble) -> Arm:
         init=model.init, refresh=lambda _, params, dataset: params
     )
     return Arm(jaxpets.rewards.one_step_disagreement(model.predict), data)
+
+
+def _info_gain(config: Config, model: jaxpets.Ensemble) -> Arm:
+    """Information gain over the same w_base as SU-PETS."""
+    return _epistemic(config, model)._replace(
+        reward_fn=jaxpets.rewards.information_gain
+    )
+
+
+def _scaled(config: Config, model: jaxpets.Ensemble) -> Arm:
+    """The paper's reward over the variance of the data."""
+    data = jaxpets.RewardData(
+        init=lambda key: jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32),
+        refresh=lambda _, params, dataset: (
+            moments(dataset.data.obs, dataset.size)[1] ** 2
+        ),
+    )
+    return Arm(jaxpets.rewards.epistemic, data)
+
+
+def _scaled_log(config: Config, model: jaxpets.Ensemble) -> Arm:
+    data = jaxpets.RewardData(
+        init=lambda key: jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32),
+        refresh=lambda _, params, dataset: (
+            0.01 * moments(dataset.data.obs, dataset.size)[1] ** 2
+        ),
+    )
+    return Arm(jaxpets.rewards.information_gain, data)

@@ -56,7 +56,11 @@ def build(config: Config) -> Parts:
     fitter = jaxpets.fit(
         trained,
         optax.adam(config.training.learning_rate),
-        jaxpets.FitConfig(config.training.num_epochs, config.training.batch_size),
+        jaxpets.FitConfig(
+            config.training.num_epochs,
+            config.training.batch_size,
+            config.training.final_rate,
+        ),
     )
     planned = _ensemble(size, jaxpets.Precision(config.planner.precision))
     arm = make_arm(config, planned)

@@ -10,7 +10,16 @@ from experiments.errors import UsageError
 
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
-ArmName = Literal["epistemic", "count", "random", "oracle", "one-step"]
+ArmName = Literal[
+    "epistemic",
+    "count",
+    "random",
+    "oracle",
+    "one-step",
+    "info-gain",
+    "scaled",
+    "scaled-log",
+]
 EngineName = Literal["mjx", "mujoco"]
 TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
 
@@ -44,6 +53,8 @@ class TrainingNumbers:
     """Rows per member and gradient step."""
     learning_rate: float = number(1e-3, 1e-9, 1.0)
     """Of Adam."""
+    final_rate: float = number(1.0, 0.0, 1.0)
+    """Share of the learning rate that is left at the end of every fit."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,12 +7,17 @@ from jaxpets._src.pseudo_counts import (
     pseudo_count,
     simhash,
 )
-from jaxpets._src.rewards import epistemic, one_step_disagreement
+from jaxpets._src.rewards import (
+    epistemic,
+    information_gain,
+    one_step_disagreement,
+)
 
 __all__ = [
     "PseudoCounts",
     "count_states",
     "epistemic",
+    "information_gain",
     "lookup",
     "one_step_disagreement",
     "pseudo_count",

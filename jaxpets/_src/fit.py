@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxpets._src.checks import check_count, check_key
+from jaxpets._src.checks import check_count, check_key, check_real
 from jaxpets._src.ensemble import Ensemble, EnsembleParams, NetworkParams
 from jaxpets._src.types import Dataset
 
@@ -24,14 +24,20 @@ class FitConfig:
     Attributes:
       num_epochs: passes over the data per call.
       batch_size: rows per member and gradient step.
+      final_rate: the step size at the end of a call as a share of the optimizer's; it
+        falls along a cosine and starts anew with every call (SGDR, Loshchilov and
+        Hutter, 2017). 1 is PETS's constant rate, whose last steps leave noise in the
+        weights that looks like disagreement.
     """
 
     num_epochs: int = 5
     batch_size: int = 32
+    final_rate: float = 1.0
 
     def __post_init__(self) -> None:
         check_count("num_epochs", self.num_epochs)
         check_count("batch_size", self.batch_size)
+        check_real("final_rate", self.final_rate, 0.0, 1.0)
 
 
 class FitState(NamedTuple):
@@ -94,13 +100,16 @@ def fit(
 
     def update(
         network: NetworkParams, opt_state: Any, inputs: Array, targets: Array,
-        weight: Array, has_rows: Array,
+        weight: Array, has_rows: Array, done: Array,
     ) -> tuple[NetworkParams, Any, Array, Array]:  # fmt: skip
         grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
         (loss, mse), grads = grad_fn(network, inputs, targets, weight)
         # Optimizers of optax do not trace under strict promotion, if a caller set it.
         with jax.numpy_dtype_promotion("standard"):
             updates, new_state = optimizer.update(grads, opt_state, network)
+            if config.final_rate < 1.0:
+                rate = _annealed(config.final_rate, done)
+                updates = jax.tree.map(lambda x: rate * x, updates)
         stepped = cast(NetworkParams, optax.apply_updates(network, updates))
         new = ensemble.project(stepped)
         # Backpropagation ends in the first leaf, the bias of the first layer, and in
@@ -128,8 +137,9 @@ def fit(
         bootstrap = jax.random.randint(bootstrap_key, shape, 0, jnp.maximum(size, 1))
         num_batches = (size + batch_size - 1) // batch_size
 
-        def epoch(carry: tuple, key: Array) -> tuple[tuple, None]:
+        def epoch(carry: tuple, inputs_: tuple) -> tuple[tuple, None]:
             network, opt_state, skipped, _ = carry
+            number, key = inputs_
             order = jax.random.uniform(key, shape, jnp.float32)
             order = jnp.where(jnp.arange(shape[1]) < size, order, jnp.inf)
             rows = jnp.take_along_axis(bootstrap, jnp.argsort(order, axis=1), axis=1)
@@ -144,6 +154,7 @@ def fit(
                 network, opt_state, loss, mse = update(
                     network, opt_state, inputs[picked], targets[picked],
                     used / jnp.maximum(count, 1.0), has_rows,
+                    (number + i / jnp.maximum(num_batches, 1)) / config.num_epochs,
                 )  # fmt: skip
                 bad = jnp.logical_not(jnp.isfinite(loss)) & has_rows
                 share = count / size.astype(jnp.float32)
@@ -172,9 +183,17 @@ def fit(
             (zero, zero),
         )
         keys = jax.random.split(epochs_key, config.num_epochs)
-        (network, opt_state, skipped, (loss, mse)), _ = jax.lax.scan(epoch, carry, keys)
+        epochs = (jnp.arange(config.num_epochs, dtype=jnp.float32), keys)
+        (network, opt_state, skipped, (loss, mse)), _ = jax.lax.scan(
+            epoch, carry, epochs
+        )
         num_updates = (num_batches * config.num_epochs).astype(jnp.int32)
         metrics = FitMetrics(loss, mse, num_updates, skipped)
         return EnsembleParams(network, scaler), FitState(opt_state), metrics
 
     return Fitter(init, step)
+
+
+def _annealed(final: float, done: Array) -> Array:
+    """Returns a factor that falls along a cosine from 1 to `final` as done goes 0 to 1."""
+    return final + (1 - final) * (1 + jnp.cos(jnp.pi * done)) / 2

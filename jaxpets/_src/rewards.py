@@ -33,11 +33,29 @@ def epistemic(
       ValueError: if the shapes do not fit, or there is only one member.
     """
     del obs, action
-    check_array("next_obs", next_obs, ["E", "P", "D"])
-    check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
-    _check_members(next_obs.shape[0])
-    variance = jnp.var(jnp.mean(next_obs, axis=1), axis=0)
+    variance = _variance_of_means(baseline_variance, next_obs)
     return jnp.mean(jnp.sqrt(variance / baseline_variance))
+
+
+def information_gain(
+    baseline_variance: Array, obs: Array, action: Array, next_obs: Array
+) -> Array:
+    """What seeing where the particles end up would tell about the members, in nats.
+
+    `r = 1/D * sum_k log(1 + v[k] / w_base[k]) / 2`, with `v` and `w_base` of
+    `epistemic`: the information that a state, seen through noise of variance w_base,
+    holds about which member is right, where the members' means are Gaussian. Its order
+    is that of `epistemic` in one dimension. Over several, the logarithm keeps one from
+    outweighing the others, as an angle that turns without bound does.
+
+    Args and returns are those of `epistemic`.
+
+    Raises:
+      ValueError: if the shapes do not fit, or there is only one member.
+    """
+    del obs, action
+    variance = _variance_of_means(baseline_variance, next_obs)
+    return jnp.mean(jnp.log1p(variance / baseline_variance)) / 2
 
 
 def one_step_disagreement(
@@ -73,6 +91,14 @@ def one_step_disagreement(
         return jnp.mean(jnp.sqrt(ratio), -1).reshape(num_members, per_member)
 
     return reward
+
+
+def _variance_of_means(baseline_variance: Array, next_obs: Array) -> Array:
+    """Returns the variance over members of each member's mean particle, `[D]`."""
+    check_array("next_obs", next_obs, ["E", "P", "D"])
+    check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
+    _check_members(next_obs.shape[0])
+    return jnp.var(jnp.mean(next_obs, axis=1), axis=0)
 
 
 def _check_members(num_members: int) -> None:
