@@ -1,7 +1,8 @@
 """The arms of Table 1: what phase 1 seeks."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -38,6 +39,11 @@ def make_arm(config: Config, model: jaxpets.Ensemble) -> Arm:
         "info-gain": _info_gain,
         "scaled": _scaled,
         "scaled-log": _scaled_log,
+        "focus": lambda c, m: _directed(_focus, _gauss),
+        "focus-one": lambda c, m: _directed(_focus, _one_hot),
+        "goals": lambda c, m: _directed(_goals, _gauss),
+        "goals-ig": lambda c, m: _directed(_goals_ig, _gauss),
+        "ig-focus": lambda c, m: _directed(_ig_focus, _dirichlet),
     }[config.arm](config, model)
 
 
@@ -115,3 +121,56 @@ def _scaled_log(config: Config, model: jaxpets.Ensemble) -> Arm:
         ),
     )
     return Arm(jaxpets.rewards.information_gain, data)
+
+
+def _gauss(key: Array) -> Array:
+    w = jax.random.normal(key, (half_cheetah.OBS_SIZE,))
+    return w / jnp.linalg.norm(w)
+
+
+def _one_hot(key: Array) -> Array:
+    k = jax.random.randint(key, (), 0, half_cheetah.OBS_SIZE)
+    return jax.nn.one_hot(k, half_cheetah.OBS_SIZE, dtype=jnp.float32)
+
+
+def _dirichlet(key: Array) -> Array:
+    u = jax.random.exponential(key, (half_cheetah.OBS_SIZE,)) ** 3
+    return u / u.mean()
+
+
+def _directed(reward_fn: Any, draw: Any) -> Arm:
+    """A direction per trial, in units of the spread of the data."""
+    ones = jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32)
+
+    def refresh(data: Any, params: Any, dataset: jaxpets.Dataset) -> Any:
+        raw = data[0]
+        key = jax.random.fold_in(jax.random.wrap_key_data(raw), dataset.size)
+        std = moments(dataset.data.obs, dataset.size)[1]
+        return raw, draw(key), std, jaxpets.max_variance(params)
+
+    data = jaxpets.RewardData(
+        init=lambda key: (jax.random.key_data(key), ones, ones, ones),
+        refresh=refresh,
+    )
+    return Arm(reward_fn, data)
+
+
+def _focus(data: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+    _, w, std, _ = data
+    return jnp.std(jnp.mean(next_obs, axis=1) @ (w / std))
+
+
+def _goals(data: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+    _, w, std, _ = data
+    return next_obs @ (w / std)
+
+
+def _goals_ig(data: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+    gain = jaxpets.rewards.information_gain(data[3], obs, action, next_obs)
+    return 5 * gain + jnp.mean(_goals(data, obs, action, next_obs))
+
+
+def _ig_focus(data: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+    _, w, _, base = data
+    v = jnp.var(jnp.mean(next_obs, axis=1), axis=0)
+    return jnp.mean(w * jnp.log1p(v / base)) / 2

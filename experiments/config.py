@@ -11,15 +11,9 @@ from experiments.errors import UsageError
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
 ArmName = Literal[
-    "epistemic",
-    "count",
-    "random",
-    "oracle",
-    "one-step",
-    "info-gain",
-    "scaled",
-    "scaled-log",
-]
+    "epistemic", "count", "random", "oracle", "one-step", "info-gain", "scaled",
+    "scaled-log", "focus", "focus-one", "goals", "goals-ig", "ig-focus",
+]  # fmt: skip
 EngineName = Literal["mjx", "mujoco"]
 TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
 
