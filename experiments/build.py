@@ -11,14 +11,14 @@ from jax import Array
 
 import jaxpets
 from experiments.arms import NO_DATA, make_arm
-from experiments.config import Config, PlannerNumbers
+from experiments.config import Config, PlannerNumbers, TrainingNumbers
 from jaxpets.envs import half_cheetah
 
 State = jaxpets.LearnerState
-Learn = Callable[[Array, State, jaxpets.Transition], tuple[State, Any]]
+Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
 # Every phase draws from its own stream of keys.
-EXPLORE, ZERO_SHOT, FINETUNE = 0, 1, 2
+EXPLORE, ZERO_SHOT, FINETUNE, REFIT = 0, 1, 2, 3
 
 ENGINES = {
     "mjx": half_cheetah.half_cheetah,
@@ -39,6 +39,7 @@ class Parts(NamedTuple):
     explorer: jaxpets.Planner  # phase 1
     actor: jaxpets.Planner  # phase 2; reward data are the weights of a task
     learner: jaxpets.Learner  # phase 1
+    refitter: jaxpets.Fitter | None  # between the phases
     finetuner: jaxpets.Learner  # phase 2
 
 
@@ -53,15 +54,6 @@ def build(config: Config) -> Parts:
         state_margin=numbers.state_margin,
     )
     trained = _ensemble(size, jaxpets.Precision.TF32)
-    fitter = jaxpets.fit(
-        trained,
-        optax.adam(config.training.learning_rate),
-        jaxpets.FitConfig(
-            config.training.num_epochs,
-            config.training.batch_size,
-            config.training.final_rate,
-        ),
-    )
     planned = _ensemble(size, jaxpets.Precision(config.planner.precision))
     arm = make_arm(config, planned)
     explored = config.num_trials * config.trial_length
@@ -73,24 +65,29 @@ def build(config: Config) -> Parts:
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
     def learner(
-        data: jaxpets.RewardData, length: int, capacity: int
+        numbers: TrainingNumbers, data: jaxpets.RewardData, length: int, capacity: int
     ) -> jaxpets.Learner:
+        fitter = _fitter(trained, numbers)
         return jaxpets.learner(
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
+
+    steps = config.trial_length, config.task_length
+    refits = config.refit.num_epochs > 0
 
     return Parts(
         env=env,
         random=random,
         explorer=planner(arm.reward_fn, config.planner) if arm.reward_fn else random,
         actor=planner(half_cheetah.task_reward, config.task_planner),
-        learner=learner(arm.reward_data, config.trial_length, explored),
-        finetuner=learner(NO_DATA, config.task_length, explored + finetuned),
+        learner=learner(config.training, arm.reward_data, steps[0], explored),
+        refitter=_fitter(trained, config.refit) if refits else None,
+        finetuner=learner(config.tuning, NO_DATA, steps[1], explored + finetuned),
     )
 
 
 def over_seeds(learn: Learn, num_seeds: int) -> Learn:
-    """Maps `Learner.learn` over one more leading axis of everything.
+    """Maps a Learn, as `Learner.learn`, over one more leading axis of everything.
 
     An axis of one is left out: XLA does not simplify gathers over it, and training
     would take a third longer on a GPU.
@@ -98,7 +95,7 @@ def over_seeds(learn: Learn, num_seeds: int) -> Learn:
     if num_seeds > 1:
         return jax.vmap(learn, (0, LEARNER_AXES, 0), (LEARNER_AXES, 0))
 
-    def learn_one(keys: Array, state: State, transitions: jaxpets.Transition) -> Any:
+    def learn_one(keys: Array, state: State, transitions: Any) -> Any:
         state, transitions = jax.tree.map(
             lambda x: x[0] if x.ndim else x, (state, transitions)
         )
@@ -117,6 +114,11 @@ def trial_keys(config: Config, phase: int, trial: int) -> Array:
         return jax.random.fold_in(jax.random.fold_in(seed, phase), trial)
 
     return jax.vmap(one)(jnp.stack([jax.random.key(s) for s in config.seeds]))
+
+
+def _fitter(ensemble: jaxpets.Ensemble, numbers: TrainingNumbers) -> jaxpets.Fitter:
+    size = jaxpets.FitConfig(numbers.num_epochs, numbers.batch_size, numbers.final_rate)
+    return jaxpets.fit(ensemble, optax.adam(numbers.learning_rate), size)
 
 
 def _ensemble(

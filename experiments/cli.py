@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from experiments import rundir
-from experiments.config import PRESETS, Config, ranges, validate
+from experiments.config import PRESETS, Config, numbers_of, ranges, validate
 from experiments.errors import CheckpointError, UsageError
 from experiments.hosts import Place
 
@@ -39,7 +39,7 @@ def parse(argv: Sequence[str]) -> Config:
     first = _first_flags(argv)
     if first.name is not None:
         _check_name(first.name)
-    default = PRESETS[first.preset]
+    default = numbers_of(first.preset, first.arm)
     if first.phase in ("zero-shot", "finetune"):
         _tyro(argv, default)  # what is wrong with the flags comes before the run
         default = _explored(first, default)

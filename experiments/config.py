@@ -11,9 +11,8 @@ from experiments.errors import UsageError
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
 ArmName = Literal[
-    "epistemic", "count", "random", "oracle", "one-step", "info-gain", "scaled",
-    "scaled-log", "focus", "focus-one", "goals", "goals-ig", "ig-focus",
-]  # fmt: skip
+    "epistemic", "count", "random", "oracle", "one-step", "info-gain", "best"
+]
 EngineName = Literal["mjx", "mujoco"]
 TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
 
@@ -39,16 +38,16 @@ class ModelNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingNumbers:
-    """Fitting after every trial."""
+    """A fit: `training` and `tuning` after every trial, `refit` before phase 2."""
 
-    num_epochs: int = number(5, 1, 10_000)
-    """Passes over all data."""
+    num_epochs: int = number(5, 0, 10_000)
+    """Passes over all data; refit: 0 goes on with the model as it was explored."""
     batch_size: int = number(32, 1, 65_536)
     """Rows per member and gradient step."""
     learning_rate: float = number(1e-3, 1e-9, 1.0)
     """Of Adam."""
     final_rate: float = number(1.0, 0.0, 1.0)
-    """Share of the learning rate that is left at the end of every fit."""
+    """Share of the learning rate that is left at the end of a fit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +95,8 @@ class Config:
     """Numbers to start from: minutes on a laptop, the paper's, or seconds."""
     arm: ArmName = "epistemic"
     """What exploration seeks: disagreement of the ensemble (SU-PETS), rare states
-    (count), nothing (random), the forward task (oracle), or one-step disagreement."""
+    (count), nothing (random), the forward task (oracle), one-step disagreement,
+    information gain, or disagreement in units of the data (best)."""
     task: TaskName = "all"
     """For zero-shot and finetune."""
     seeds: tuple[int, ...] = (0,)
@@ -145,6 +145,8 @@ class Config:
     """Show tracebacks."""
     model: ModelNumbers = ModelNumbers()
     training: TrainingNumbers = TrainingNumbers()
+    refit: TrainingNumbers = TrainingNumbers(400, 128, final_rate=0.005)
+    tuning: TrainingNumbers = TrainingNumbers(final_rate=0.02)
     planner: PlannerNumbers = PlannerNumbers()
     task_planner: PlannerNumbers = PlannerNumbers()
 
@@ -183,7 +185,9 @@ PRESETS = {
         chunk_length=10,
         milestones=(),
         model=ModelNumbers(hidden_size=128, num_layers=3),
-        training=TrainingNumbers(num_epochs=20, batch_size=64, learning_rate=2e-3),
+        training=TrainingNumbers(20, 64, 2e-3),
+        refit=TrainingNumbers(100, 64, 2e-3, final_rate=0.005),
+        tuning=TrainingNumbers(20, 64, 2e-3, final_rate=0.02),
         planner=_LAPTOP_PLANNER,
         task_planner=dataclasses.replace(_LAPTOP_PLANNER, noise_beta=0.5),
     ),
@@ -198,11 +202,25 @@ PRESETS = {
         chunk_length=10,
         milestones=(),
         model=ModelNumbers(num_members=3, hidden_size=16, num_layers=2),
-        training=TrainingNumbers(num_epochs=1, batch_size=16),
+        training=TrainingNumbers(1, 16),
+        refit=TrainingNumbers(0),
+        tuning=TrainingNumbers(1, 16),
         planner=_SMOKE_PLANNER,
         task_planner=_SMOKE_PLANNER,
     ),
 }
+
+
+# How `best` searches when it performs: in noise that keeps its direction for a while.
+_BEST_SEARCH = dataclasses.replace(PlannerNumbers(), optimizer="icem", noise_beta=0.5)
+
+
+def numbers_of(preset: Preset, arm: ArmName) -> Config:
+    """Returns the numbers to start from; `best` brings its own search to `paper`."""
+    config = PRESETS[preset]
+    if (preset, arm) == ("paper", "best"):
+        config = dataclasses.replace(config, task_planner=_BEST_SEARCH)
+    return config
 
 
 def validate(config: Config) -> None:
@@ -218,9 +236,12 @@ def validate(config: Config) -> None:
     _require(unique, "--seeds", config.seeds, "one or more different seeds")
     _check_planner("--planner", config.planner, config.model)
     _check_planner("--task-planner", config.task_planner, config.model)
+    for name in ("training", "tuning"):
+        epochs = getattr(config, name).num_epochs
+        _require(epochs > 0, f"--{name}.num-epochs", epochs, "1 to 10,000")
     members = config.model.num_members
     _require(
-        members >= 2 or config.arm not in ("epistemic", "one-step"),
+        members >= 2 or config.arm in ("count", "random", "oracle"),
         "--model.num-members",
         members,
         f"2 or more for --arm {config.arm}; one member never disagrees",

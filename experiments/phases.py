@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import acting, devices, hosts, loop, records, rundir
+from experiments import acting, checkpoint, devices, hosts, loop, records, rundir
 from experiments.acting import Tick, Trials
 from experiments.build import (
     EXPLORE,
@@ -30,6 +30,7 @@ from experiments.config import Config
 from experiments.devices import SEED, TASK, Spread
 from experiments.loop import Loop, Say
 from experiments.progress import Progress
+from experiments.refit import refit
 from jaxpets.envs import half_cheetah
 
 
@@ -70,14 +71,14 @@ def explore(config: Config, folder: Path, say: Say) -> None:
 def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -> None:
     """Phase 2, first attempt: tasks planned with the explored model, nothing learned.
 
-    The jump-start of Table 1.
+    The jump-start of Table 1. The model that performs is saved beside its log.
     """
     log = folder / "metrics.jsonl"
     if hosts.on_first(lambda: rundir.log_size(log)):  # written once, at the end
         say(f"already complete: {config.eval_trials} of {config.eval_trials} trials.")
         return
     parts = build(config)
-    model = _explored(config, source, step, parts, say, only_model=True)
+    model = _performing(config, source, folder, step, parts, say)
     names, weights = _tasks(config)
     spread = _spread(say, len(config.seeds), len(names), config.eval_trials)
     actors = acting.performers(
@@ -143,6 +144,9 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
     learn = loop.learner(spread, parts.finetuner.learn, SEED, TASK)
     keys = lambda trial: _fan(trial_keys(config, FINETUNE, trial), _task_ids(names))  # noqa: E731
     explored = _explored(config, source, step, parts, say)
+    begun = hosts.on_first(lambda: bool(checkpoint.steps(folder / "checkpoints")))
+    if parts.refitter and not begun:
+        explored = refit(config, parts.refitter, explored, step, say)
     capacity = explored.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
     init = _branch(explored, len(names), capacity)
@@ -154,6 +158,23 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
         trials = jax.tree.map(lambda x: x[:, :, None], trials)
         paths = folder / "trajectories.npz"
         hosts.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
+
+
+def _performing(
+    config: Config, source: Path, folder: Path, step: int, parts: Parts, say: Say
+) -> State:
+    """Returns the model `[S]` to perform with, from a run that was stopped or anew."""
+    checkpoints = folder / "checkpoints"
+    template = model_of(explored_template(config, parts))
+    if found := loop.restore(checkpoints, template, say):
+        return found[1]
+    fitter = parts.refitter
+    state = _explored(config, source, step, parts, say, only_model=fitter is None)
+    if fitter:
+        state = refit(config, fitter, state, step, say)
+    model = model_of(state)
+    hosts.on_first(lambda: checkpoint.save(checkpoints, step, model, {}, finite=model))
+    return model
 
 
 def _spread(say: Say, *counts: int) -> Spread:

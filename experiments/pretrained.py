@@ -1,49 +1,81 @@
 """`python -m experiments.pretrained RUN NAME`: ships an explored model with the code.
 
-Of a run are kept its config, environment and log, and of its last checkpoint the model
-alone: enough for `--phase zero-shot --from pretrained/NAME`, not to learn on. Tasks are
-planned with the numbers of the preset `laptop` and a longer horizon, one trial each, so
-that a laptop is enough; flags bring back the run's own.
+Of a run are kept its config, environment and log, and the model that performed in its
+last zero-shot: enough for `--phase zero-shot --from pretrained/NAME`, not to learn on.
+Tasks are planned with the numbers of the preset `laptop` and a longer horizon, a trial
+each, so that a laptop is enough; flags bring back the run's own.
 """
 
 import argparse
 import dataclasses
+import json
 import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
+
 from experiments import checkpoint, cli, phases, rundir
 from experiments.build import build
-from experiments.config import PRESETS
+from experiments.config import PRESETS, Config
 from experiments.errors import RunError, UsageError
 
 
-def ship(run: Path, name: str) -> Path:
+def ship(run: Path, name: str, seed: int | None = None) -> Path:
     """Writes the model of an exploration run to `results/pretrained/NAME`.
 
+    Args:
+      run: folder of an exploration run that has performed.
+      name: of the model.
+      seed: which of the run's; by default the first.
+
     Raises:
-      RunError: if the run has no checkpoint, or there is a model of that name.
+      RunError: if the run has not performed, does not have that seed, or there is a
+        model of that name.
     """
     rundir.check_name(name)
     folder = cli.PRETRAINED / name
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
     config = cli.from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
-    template = phases.model_of(phases.explored_template(config, build(config)))
-    found = checkpoint.restore(run / "checkpoints", template, part=True, warn=print)
-    if found is None:
-        raise UsageError(f"there is no checkpoint in {run}.")
-    step, state, _ = found
+    seed = config.seeds[0] if seed is None else seed
+    if seed not in config.seeds:
+        valid = ", ".join(map(str, config.seeds))
+        raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
+    step, state = _performed(run, config)
+    i = config.seeds.index(seed)
+    state = jax.tree.map(lambda x: x[i : i + 1], state)
     planner = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
     shipped = dataclasses.replace(
-        config, out=Path("runs"), eval_trials=1, task_planner=planner
+        config,
+        out=Path("runs"),
+        seeds=(seed,),
+        eval_trials=1,
+        refit=dataclasses.replace(config.refit, num_epochs=0),  # as it performed
+        task_planner=planner,
     )
     checkpoint.save(folder / "checkpoints", step, state, {}, finite=state)
     rundir.write_json(folder / "config.json", cli.to_json(shipped))
-    for file in ("env.json", "metrics.jsonl"):
-        shutil.copyfile(run / file, folder / file)
+    shutil.copyfile(run / "env.json", folder / "env.json")
+    rows = (run / "metrics.jsonl").read_text().splitlines()
+    rundir.append_rows(
+        folder / "metrics.jsonl",
+        [row for row in map(json.loads, rows) if row["seed"] == seed],
+    )
     return folder
+
+
+def _performed(run: Path, config: Config) -> tuple[int, phases.State]:
+    """Returns the model `[S]` of the last zero-shot, and after which trial it was."""
+    folders = sorted(run.glob("zero-shot-*"))  # by the trials explored, all tasks first
+    if not folders:
+        raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
+    template = phases.model_of(phases.explored_template(config, build(config)))
+    found = checkpoint.restore(folders[-1] / "checkpoints", template, warn=print)
+    if found is None:
+        raise UsageError(f"there is no checkpoint in {folders[-1]}.")
+    return found[:2]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,9 +83,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="experiments.pretrained", description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an exploration run")
     parser.add_argument("name", help="what --from pretrained/NAME will call it")
+    parser.add_argument("--seed", type=int, help="by default the run's first")
     args = parser.parse_args(argv)
     try:
-        print(f"wrote {ship(args.run, args.name)}")
+        print(f"wrote {ship(args.run, args.name, args.seed)}")
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

@@ -2,7 +2,13 @@
 
 from jaxpets import rewards
 from jaxpets._src.cem import CEMState, cem
-from jaxpets._src.dataset import DATASET_AXES, append, grow, init_dataset
+from jaxpets._src.dataset import (
+    DATASET_AXES,
+    append,
+    grow,
+    init_dataset,
+    obs_variance,
+)
 from jaxpets._src.ensemble import (
     Ensemble,
     EnsembleConfig,
@@ -87,6 +93,7 @@ __all__ = [
     "learner",
     "max_variance",
     "mppi",
+    "obs_variance",
     "particle_rollout",
     "plan",
     "random_planner",

@@ -44,6 +44,7 @@ def explored(out, name="smoke-epistemic", **changes):
     return path
 
 
+EPOCHS = ["--tuning.num-epochs 0", "1 to 10,000"]
 TRIALS = ["--num-trials", "1 to 100,000"]
 ELITES = ["--planner.num-elites", "9", "2 to --planner.num-samples (8)"]
 AT = ("--coordinator-address", "host:1")
@@ -72,6 +73,7 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
             for v in ("abc", "nan", "inf", "1e9", "2.5")
         ],
         ((*SMOKE, "--num-trials"), TRIALS[:1]),
+        ((*SMOKE, "--tuning.num-epochs", "0"), EPOCHS),
         ((*SMOKE, "--num_trials=0"), TRIALS),
         ((*SMOKE, "--seeds"), ["--seeds", "one or more different"]),
         ((*SMOKE, "--seeds", "-1"), ["--seeds", "-1", "0 to 4294967295"]),
@@ -258,3 +260,15 @@ def test_the_paper_preset_has_the_numbers_of_the_paper():
     assert (paper.planner.horizon, paper.planner.num_particles) == (30, 20)
     assert paper.planner == paper.task_planner
     assert isinstance(paper, Config)
+
+
+def test_best_is_the_paper_with_another_search_for_tasks():
+    flags = ["--phase", "explore", "--preset", "paper"]
+    plain, best = cli.parse(flags), cli.parse([*flags, "--arm", "best"])
+    assert best.task_planner.optimizer == "icem"
+    changed = {"arm": "best", "task_planner": best.task_planner}
+    assert best == dataclasses.replace(plain, **changed)
+    flags += ["--arm", "best", "--task-planner.horizon", "20"]
+    assert cli.parse(flags).task_planner.horizon == 20
+    laptop = cli.parse(["--phase", "explore", "--arm", "best"])
+    assert laptop.task_planner == PRESETS["laptop"].task_planner

@@ -129,3 +129,14 @@ def test_sizes_are_positive(sizes):
 def test_sizes_are_integers():
     with pytest.raises(TypeError, match="capacity must be a Python int"):
         jaxpets.init_dataset(1e4, 2, 1)
+
+
+def test_the_variance_is_that_of_the_rows_that_are_there():
+    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    np.testing.assert_array_equal(jaxpets.obs_variance(dataset), [1.0, 1.0])
+    dataset = jaxpets.append(dataset, numbered(3, 5))
+    want = np.arange(3.0, 8.0).var()
+    np.testing.assert_allclose(jaxpets.obs_variance(dataset), [want, want], rtol=1e-6)
+    dataset = jaxpets.append(dataset, numbered(8, 7))  # the oldest go
+    want = np.arange(7.0, 15.0).var()
+    np.testing.assert_allclose(jaxpets.obs_variance(dataset), [want, want], rtol=1e-6)

@@ -290,7 +290,9 @@ def _check_task(folder, labels, trials=2):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arm", ["count", "random", "oracle", "one-step"])
+@pytest.mark.parametrize(
+    "arm", ["count", "random", "oracle", "one-step", "info-gain", "best"]
+)
 def test_every_arm_explores(arm, tmp_path, capsys):
     flags = ("--arm", arm, "--num-trials", "2", "--out", str(tmp_path))
     assert main([*SMOKE, *flags]) == 0

@@ -169,6 +169,25 @@ def test_counts_its_updates(step, fitter, params, size):
     assert int(state.opt_state[0].count) == metrics.num_updates
 
 
+@pytest.mark.parametrize("final", [1.0, 0.5, 0.0])
+def test_the_rate_falls_along_a_cosine_in_every_call(model, params, final):
+    """A loss of slope 1 and steps of size 1 add up the rates of all updates."""
+    sloped = model._replace(
+        loss=lambda network, *_: (jnp.sum(network.min_logvar), jnp.zeros(()))
+    )
+    config = FitConfig(num_epochs=3, batch_size=8, final_rate=final)
+    fitter = jaxpets.fit(sloped, optax.sgd(1.0), config)
+    step, dataset = jax.jit(fitter.step), dataset_of(toys.transitions(29))
+    count = 3 * 4
+    # The cosines of k pi / n, k = 0 to n - 1, sum to 1.
+    want = count * final + (1 - final) * (count + 1) / 2
+    first, state, _ = step(params, jax.random.key(0), fitter.init(params), dataset)
+    second, _, _ = step(first, jax.random.key(1), state, dataset)
+    for before, after in ((params, first), (first, second)):
+        fell = before.network.min_logvar - after.network.min_logvar
+        np.testing.assert_allclose(fell, want, rtol=1e-5)
+
+
 def test_growing_data_do_not_retrace(model, params):
     fitter = jaxpets.fit(model, optax.adam(1e-3), FitConfig(num_epochs=1, batch_size=8))
     step = jax.jit(fitter.step)

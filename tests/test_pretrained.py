@@ -1,6 +1,7 @@
 """Models that come with the code: what is shipped, and that it acts as its run does."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -16,11 +17,23 @@ SMALL = (
     "--task-planner.num-elites", "2", "--task-planner.num-iterations", "2",
     "--task-planner.num-particles", "15",
 )  # fmt: skip
+REFIT = ("--refit.num-epochs", "2", "--refit.batch-size", "16")
 
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    return runs.explore(tmp_path_factory.mktemp("explored"), 0)
+    """A run that has performed after a refit, with the search of what is shipped."""
+    folder = runs.explore(tmp_path_factory.mktemp("explored"), 0)
+    planner = cli.PRESETS["laptop"].task_planner
+    search = {
+        "optimizer": planner.optimizer,
+        "noise-beta": str(planner.noise_beta),
+        "precision": planner.precision,
+    }
+    flags = [x for f, v in search.items() for x in (f"--task-planner.{f}", v)]
+    command = ["--phase", "zero-shot", "--from", str(folder), *SMALL, *REFIT, *flags]
+    assert main(command) == 0
+    return folder
 
 
 @pytest.fixture
@@ -54,16 +67,6 @@ def test_a_shipped_model_acts_as_its_run(explored, shelf, tmp_path, capsys):
     assert zero_shot("pretrained/mine", tmp_path / "out") == 0
     # Nothing is written beside the model.
     assert not list(folder.glob("zero-shot*"))
-    # The laptop's planner, but for the numbers that are given.
-    planner = cli.PRESETS["laptop"].task_planner
-    flags = {
-        "optimizer": planner.optimizer,
-        "noise-beta": planner.noise_beta,
-        "precision": planner.precision,
-    }
-    command = ["--phase", "zero-shot", "--from", str(explored), *SMALL]
-    command += [x for f, v in flags.items() for x in (f"--task-planner.{f}", str(v))]
-    assert main(command) == 0
     want = returns(explored)
     assert returns(tmp_path / "out" / "pretrained-mine") == want
     assert all(np.isfinite(list(want.values())))
@@ -81,6 +84,15 @@ def test_a_name_is_taken_once(explored, shelf, capsys):
     assert pretrained.main([str(explored), "mine"]) == 2
     line = f"error: there is a model in {shelf / 'mine'} already; remove it first.\n"
     assert capsys.readouterr().err == line
+
+
+def test_only_a_model_that_performed_is_shipped(explored, shelf, tmp_path, capsys):
+    idle = tmp_path / runs.NAME
+    shutil.copytree(explored, idle, ignore=shutil.ignore_patterns("zero-shot*"))
+    assert pretrained.main([str(idle), "mine"]) == 2
+    line = f"error: {idle} has not performed; run --phase zero-shot first.\n"
+    assert capsys.readouterr().err == line
+    assert not shelf.exists()
 
 
 def test_an_unknown_name_is_an_error(shelf, tmp_path, capsys):

@@ -6,7 +6,7 @@ import reference
 import toys
 
 import jaxpets
-from jaxpets.rewards import epistemic, one_step_disagreement
+from jaxpets.rewards import epistemic, information_gain, one_step_disagreement
 
 E, P, D = 5, 4, 6
 
@@ -90,6 +90,49 @@ def test_epistemic_refuses_what_does_not_fit():
         reward(states[0], base)
     with pytest.raises(ValueError, match="at least 2 members, got 1"):
         reward(states[:1], base)
+
+
+# -- information gain ----------------------------------------------------------------
+
+
+def test_information_gain_equals_the_reference():
+    states, base = particles()
+    got = information_gain(jnp.asarray(base), states, jnp.zeros(2), states)
+    variance = states.astype(np.float64).mean(1).var(0)
+    want = np.mean(np.log(1 + variance / base.astype(np.float64))) / 2
+    assert got.shape == ()
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_information_gain_of_small_disagreement_is_half_its_square():
+    """And in one dimension it orders states as `epistemic` does."""
+    spread = np.linspace(1e-3, 5.0, 50, dtype=np.float32)
+    states = spread[:, None, None, None] * np.array([-1, 1], np.float32)[:, None, None]
+    zeros = jnp.zeros((2, 1, 1))
+    gains, roots = (
+        jnp.stack([fn(jnp.ones(1), zeros, jnp.zeros(2), x) for x in states])
+        for fn in (information_gain, epistemic)
+    )
+    np.testing.assert_allclose(gains[0], roots[0] ** 2 / 2, rtol=1e-4)
+    assert (np.diff(gains) > 0).all() and (np.diff(roots) > 0).all()
+
+
+def test_no_dimension_of_information_gain_outweighs_the_others():
+    """An angle that the members see turn without bound adds its logarithm."""
+    states, base = particles()
+    states[..., 2] *= 1e4
+    far = information_gain(jnp.asarray(base), states, jnp.zeros(2), states)
+    states[..., 2] *= 10
+    farther = information_gain(jnp.asarray(base), states, jnp.zeros(2), states)
+    np.testing.assert_allclose(farther - far, np.log(10) / D, rtol=1e-4)
+
+
+def test_information_gain_refuses_what_does_not_fit():
+    states, base = particles()
+    with pytest.raises(ValueError, match="at least 2 members, got 1"):
+        information_gain(jnp.asarray(base), states[:1], jnp.zeros(2), states[:1])
+    with pytest.raises(ValueError, match="baseline_variance must be"):
+        information_gain(jnp.asarray(base[:3]), states, jnp.zeros(2), states)
 
 
 # -- one-step disagreement -----------------------------------------------------------

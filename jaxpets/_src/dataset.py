@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.moments import moments
 from jaxpets._src.types import Dataset, Transition
 
 _MAPPED: Any = 0
@@ -89,3 +90,13 @@ def grow(dataset: Dataset, capacity: int) -> Dataset:
 
     data = Transition(*(widen(rows) for rows in dataset.data))
     return Dataset(data, dataset.size, dataset.size % capacity)
+
+
+def obs_variance(dataset: Dataset) -> Array:
+    """Returns the variance of the observations seen, `[D]` in units of obs squared.
+
+    1 where there is none, as before any data. As the baseline variance of an
+    exploration reward it counts disagreement in units of what was seen.
+    """
+    _, std = moments(dataset.data.obs, dataset.size)
+    return std**2

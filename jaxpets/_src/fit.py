@@ -195,5 +195,5 @@ def fit(
 
 
 def _annealed(final: float, done: Array) -> Array:
-    """Returns a factor that falls along a cosine from 1 to `final`, as done goes to 1."""
+    """Returns a factor: 1, falling along a cosine to `final` as `done` goes to 1."""
     return final + (1 - final) * (1 + jnp.cos(jnp.pi * done)) / 2

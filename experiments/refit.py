@@ -1,0 +1,48 @@
+"""One more fit, between exploration and phase 2, until the model has settled.
+
+Exploration fits a few epochs at a constant rate after every trial, as PETS does. That
+is enough to go on exploring; for performing a task the last steps leave noise in the
+weights, and what came late was shown a few times only.
+"""
+
+import time
+
+import jax
+from jax import Array
+
+import jaxpets
+from experiments import devices, loop
+from experiments.build import REFIT, State, trial_keys
+from experiments.config import Config
+from experiments.devices import SEED
+from experiments.loop import Say
+
+
+def refit(
+    config: Config, fitter: jaxpets.Fitter, state: State, step: int, say: Say
+) -> State:
+    """Returns the learner `[S]` after one more fit.
+
+    Args:
+      config: reads `refit` and `seeds`.
+      fitter: made with these numbers.
+      state: learner `[S]` explored until trial `step`; consumed.
+      step: the keys depend on it.
+      say: gets one line.
+    """
+    spread = devices.spread(len(config.seeds))
+
+    def learn(key: Array, state: State, nothing: tuple[()]) -> tuple[State, object]:
+        del nothing  # a learner's new transitions
+        params, fit, metrics = fitter.step(state.params, key, state.fit, state.dataset)
+        return state._replace(params=params, fit=fit), metrics
+
+    begin = time.monotonic()
+    rows, epochs = int(state.dataset.size), config.refit.num_epochs
+    keys = devices.place(spread, trial_keys(config, REFIT, step), SEED)
+    state = devices.place(spread, state, SEED)
+    state, _ = loop.learner(spread, learn, SEED)(keys, state, ())
+    state = devices.collect(spread, jax.block_until_ready(state), SEED)
+    seconds = time.monotonic() - begin
+    say(f"refit: {epochs} epochs of {rows:,} transitions  {seconds:.1f} s")
+    return state
