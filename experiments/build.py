@@ -60,7 +60,7 @@ def build(config: Config) -> Parts:
     finetuned = config.finetune_trials * config.task_length
 
     def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
-        return jaxpets.plan(_rollout(size, search), reward_fn, _optimizer(search, env))
+        return jaxpets.plan(_rollout(size, search), reward_fn, optimizer(search, env))
 
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
@@ -157,9 +157,8 @@ def _weight_decays(num_layers: int) -> tuple[float, ...]:
     return (first, *inner, last)
 
 
-def _optimizer(
-    numbers: PlannerNumbers, env: jaxpets.Env
-) -> jaxpets.TrajectoryOptimizer:
+def optimizer(numbers: PlannerNumbers, env: jaxpets.Env) -> jaxpets.TrajectoryOptimizer:
+    """Returns the search that the numbers describe."""
     size = {
         "horizon": numbers.horizon,
         "action_low": env.action_low,

@@ -211,6 +211,8 @@ PRESETS = {
 }
 
 
+# What models that come with the code perform with: the laptop's search, further ahead.
+PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
 # How `best` searches when it performs: in noise that keeps its direction for a while.
 _BEST_SEARCH = dataclasses.replace(PlannerNumbers(), optimizer="icem", noise_beta=0.5)
 

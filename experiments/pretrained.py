@@ -18,7 +18,7 @@ import jax
 
 from experiments import checkpoint, cli, phases, rundir
 from experiments.build import build
-from experiments.config import PRESETS, Config
+from experiments.config import PRESETS, PRETRAINED_PLANNER, Config
 from experiments.errors import RunError, UsageError
 
 
@@ -46,14 +46,13 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     step, state = _performed(run, config)
     i = config.seeds.index(seed)
     state = jax.tree.map(lambda x: x[i : i + 1], state)
-    planner = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
     shipped = dataclasses.replace(
         config,
         out=Path("runs"),
         seeds=(seed,),
         eval_trials=1,
         refit=dataclasses.replace(config.refit, num_epochs=0),  # as it performed
-        task_planner=planner,
+        task_planner=PRETRAINED_PLANNER,
     )
     checkpoint.save(folder / "checkpoints", step, state, {}, finite=state)
     rundir.write_json(folder / "config.json", cli.to_json(shipped))

@@ -117,6 +117,7 @@ def _write(rows: Sequence[Row], out: Path, files: _Files) -> None:
         "",
         "The arms value different things; compare their turns, not their values.",
         "",
+        *_ablation(out / "ablation.jsonl"),
         *_runs(rows, out),
     ]
     files.report.write_text("\n".join(lines))
@@ -232,6 +233,18 @@ def _fine_tuning(rows: Sequence[Row], explored: int) -> list[str]:
         return [*lines, "No fine-tuning log.", ""]
     lines += ["Return of each trial; the first is planned with the explored model.", ""]
     return lines + [line for table in tables_by_task for line in table]
+
+
+def _ablation(path: Path) -> list[str]:
+    """Returns the section on recipes that were tried, if there is a file of them."""
+    if not path.exists():
+        return []
+    text = (
+        "Zero-shot returns, means over seeds and trials. Seeds 100 and 101 are those "
+        "on which `best` was chosen; they are in no other table."
+    )
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    return ["## Ablation", "", text, "", *tables.ablation(rows)]
 
 
 def _runs(rows: Sequence[Row], out: Path) -> list[str]:

@@ -142,6 +142,23 @@ def fine_tuning(task: str, tuning: Mapping[str, Points]) -> list[str]:
     return [f"{task}:", "", *table(["trial", *tuning], rows)]
 
 
+def ablation(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Returns mean zero-shot returns of recipes that were tried.
+
+    Args:
+      rows: with the texts `exploration`, `refit` and `search`, `seeds`, and `returns`
+        by task: a list of returns per seed.
+    """
+    lines = []
+    for row in rows:
+        means = [
+            number(float(np.mean(np.concatenate(row["returns"][t])))) for t in TASKS
+        ]
+        seeds = " ".join(map(str, row["seeds"]))
+        lines.append([row["exploration"], row["refit"], row["search"], seeds, *means])
+    return table(["exploration", "refit", "search", "seeds", *TASKS], lines)
+
+
 def seconds(by_run: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     """Returns the median seconds of a trial by run; an item per trial."""
     rows = []

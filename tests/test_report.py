@@ -207,6 +207,23 @@ def test_data_efficiency_is_a_table_of_its_own(out):
     assert table["epistemic"]["forward"]["mean"] == 600.0
 
 
+def test_the_ablation_is_a_table_of_means_over_seeds_and_trials(out):
+    assert "## Ablation" not in report_of(out)[0]
+    returns = {
+        task: [[10.0 * i, 20.0], [30.0, 40.0]] for i, task in enumerate(TASK_NAMES)
+    }
+    row = {
+        "exploration": "curiosity",
+        "refit": "none",
+        "search": "CEM",
+        "seeds": [8, 9],
+    }
+    (out / "ablation.jsonl").write_text(json.dumps(row | {"returns": returns}) + "\n")
+    text, table = report_of(out)
+    assert "| curiosity | none | CEM | 8 9 | 22 | 25 | 28 | 30 |" in text
+    assert "curiosity" not in json.dumps(table)
+
+
 def test_null_returns_are_left_out_and_counted(out):
     def lose(row):
         if row["task"] == "forward" and (row["seed"] == 2 or row["trial"] == 1):
