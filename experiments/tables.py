@@ -142,6 +142,18 @@ def fine_tuning(task: str, tuning: Mapping[str, Points]) -> list[str]:
     return [f"{task}:", "", *table(["trial", *tuning], rows)]
 
 
+def measures(by_arm: Mapping[str, Mapping[int, Mapping[str, float]]]) -> list[str]:
+    """Returns any measures of seeds: arms by measures, which all seeds have."""
+    columns = list(
+        dict.fromkeys(x for s in by_arm.values() for m in s.values() for x in m)
+    )
+    rows = [
+        [arm, *(cell({seed: m[name] for seed, m in seeds.items()}) for name in columns)]
+        for arm, seeds in by_arm.items()
+    ]
+    return table(["arm", *columns], rows)
+
+
 def seconds(by_run: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     """Returns the median seconds of a trial by run; an item per trial."""
     rows = []
