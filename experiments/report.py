@@ -59,14 +59,14 @@ def write_report(out: Path, target: Path) -> list[Path]:
     under these names, the others with the preset in the name.
 
     Args:
-      out: holds runs at any depth.
+      out: holds runs at any depth, and model_error.json if there is one.
       target: folder to write into; made if it is not there.
 
     Returns:
       The files written.
 
     Raises:
-      UsageError: as `load`, for coverage.json too.
+      UsageError: as `load`, for coverage.json and model_error.json too.
     """
     rows = load(out)
     seen = coverage.load(out)
@@ -125,6 +125,7 @@ def _write(
         "The arms value different things; compare their turns, not their values.",
         "",
         *data_sections.covered(counts, files.coverage),
+        *data_sections.model_error(out / "model_error.json", rows[0].preset),
         *_runs(rows, out),
     ]
     files.report.write_text("\n".join(lines))
