@@ -1,4 +1,4 @@
-"""Models on the data of others: the numbers, the pairs, the program and its table."""
+"""Models on the data of others: the numbers, the pairs and the program."""
 
 import json
 import operator
@@ -10,14 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import runs
-from small_logs import explore_rows, write_run
 
 import jaxpets
 from benchmarks import model_quality
 from experiments import cli, model_error
 from experiments.build import build
 from experiments.errors import UsageError
-from experiments.report import write_report
 from experiments.run import main
 from jaxpets.envs import half_cheetah
 
@@ -283,65 +281,3 @@ def test_runs_that_cannot_be_compared(explored, tmp_path):
     shutil.copy(random / "config.json", other / "config.json")
     with pytest.raises(UsageError, match="there is no checkpoint in"):
         model_error.measure([epistemic, other], AFTER, None)
-
-
-# The report.
-
-
-def entry(mean, std, pairs):
-    return {"mean": mean, "std": std, "pairs": pairs}
-
-
-TABLE = {
-    "random": {"random": None, "epistemic": entry(1.25, 0.5, 6)},
-    "epistemic": {"random": entry(0.125, None, 1), "epistemic": entry(None, None, 2)},
-}
-
-
-@pytest.fixture
-def out(tmp_path):
-    write_run(
-        tmp_path / "a", explore_rows("random", [0]), phase="explore", arm="random"
-    )
-    return tmp_path
-
-
-def written(out, **changes):
-    data = {
-        "preset": "laptop",
-        "rows": 2000,
-        "trials": {"random": {"0": 60}, "epistemic": {"0": 60, "1": 26}},
-        "error": TABLE,
-        "nll": TABLE,
-        **changes,
-    }
-    (out / "model_error.json").write_text(json.dumps(data))
-    write_report(out, out / "report")
-    return (out / "report" / "report.md").read_text()
-
-
-def test_report_has_a_table_of_each(out):
-    text = written(out)
-    assert "on 2000 transitions of every seed" in text
-    assert "Models are of trial 26, 60." in text
-    table = [
-        "| model of | data of epistemic | data of random |",
-        "|---|---|---|",
-        "| epistemic | not finite | 0.125 (1 pair) |",
-        "| random | 1.25 ± 0.5 (6 pairs) | no pair |",
-    ]
-    assert text.count("\n".join(table)) == 2
-
-
-def test_report_without_the_file_or_of_another_preset(out):
-    assert "Model error" not in written(out, preset="paper")
-    (out / "model_error.json").unlink()
-    write_report(out, out / "report")
-    assert "Model error" not in (out / "report" / "report.md").read_text()
-
-
-@pytest.mark.parametrize("text", ["{", "{}", '{"preset": "laptop"}', "[]"])
-def test_another_file_of_that_name_is_an_error(out, text):
-    (out / "model_error.json").write_text(text)
-    with pytest.raises(UsageError, match=r"is not of experiments\.model_error"):
-        write_report(out, out / "report")
