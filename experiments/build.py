@@ -35,6 +35,7 @@ class Parts(NamedTuple):
     """What the phases are made of. Nothing here is jitted."""
 
     env: jaxpets.Env
+    model: jaxpets.Ensemble  # in the precision that trains
     random: jaxpets.Planner
     explorer: jaxpets.Planner  # phase 1
     actor: jaxpets.Planner  # phase 2; reward data are the weights of a task
@@ -77,6 +78,7 @@ def build(config: Config) -> Parts:
 
     return Parts(
         env=env,
+        model=trained,
         random=random,
         explorer=planner(arm.reward_fn, config.planner) if arm.reward_fn else random,
         actor=planner(half_cheetah.task_reward, config.task_planner),

@@ -1,4 +1,4 @@
-"""Figures of the report: colour-blind-safe, every seed thin, the mean bold."""
+"""Figures of the report: colour-blind-safe; of curves, seeds thin and the mean bold."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -104,6 +105,35 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
                 below.sharey(grid[1, 0])
         grid[0, 0].set_ylabel("exploration value\nper imagined step")
         grid[1, 0].set_ylabel("turns of the pitch\nin a trial")
+        _save(figure, target)
+
+
+def coverage(
+    target: Path, mean_counts: Mapping[str, np.ndarray],
+    velocity_edges: Sequence[float], pitch_rate_edges: Sequence[float],
+) -> None:  # fmt: skip
+    """Draws mean counts `[V, W]`, a panel per arm, all in one scale of colours."""
+    seen = np.concatenate([x[x > 0] for x in mean_counts.values()])
+    low = float(seen.min())
+    # A scale needs two ends, even where all cells were seen equally often.
+    norm = LogNorm(low, max(float(seen.max()), 10 * low))
+    columns = min(len(mean_counts), 3)
+    rows = -(-len(mean_counts) // columns)
+    with mpl.rc_context(_STYLE):
+        figure = _figure(2.8 * columns + 1.2, 2.5 * rows + 0.5)
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        for axes in grid.flat[len(mean_counts) :]:
+            axes.set_visible(False)
+        for axes, (arm, counts) in zip(grid.flat, mean_counts.items(), strict=False):
+            axes.set_title(arm)
+            mesh = axes.pcolormesh(
+                velocity_edges, pitch_rate_edges,
+                np.where(counts > 0, counts, np.nan).T, norm=norm, cmap="cividis",
+            )  # fmt: skip
+            axes.tick_params(labelbottom=True)  # also above a place without a panel
+        figure.supxlabel("forward velocity, m/s", fontsize=9)
+        figure.supylabel("pitch rate, rad/s (nose down > 0)", fontsize=9)
+        figure.colorbar(mesh, ax=grid, label="transitions of a seed, mean")
         _save(figure, target)
 
 

@@ -1,7 +1,7 @@
 """Reads the logs of runs, and picks scores and curves out of them."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,12 +37,7 @@ def load(out: Path) -> list[Row]:
       UsageError: if there is no log, a line that is no row, or two rows for one seed,
         task and trial of an arm: averaging them would count a seed twice.
     """
-    logs = [
-        path
-        for path in sorted(out.rglob("metrics.jsonl"))
-        if not any(part.startswith(".") for part in path.relative_to(out).parts)
-    ]
-    rows = [row for log in logs for row in _read(log)]
+    rows = [row for log in files(out, "metrics.jsonl") for row in _read(log)]
     if not rows:
         raise UsageError(f"there is no metrics.jsonl with a row under {out}.")
     seen: dict[tuple[Any, ...], Row] = {}
@@ -58,6 +53,22 @@ def load(out: Path) -> list[Row]:
     return rows
 
 
+def files(out: Path, name: str) -> list[Path]:
+    """Returns the files of a name at any depth under a folder but for hidden ones."""
+    return [
+        path
+        for path in sorted(out.rglob(name))
+        if not any(part.startswith(".") for part in path.relative_to(out).parts)
+    ]
+
+
+def label(arm: str, config: Mapping[str, Any]) -> str:
+    """Returns what the report calls an arm: count has its number of bits, count-32."""
+    if arm == "count" and "num_bits" in config:
+        return f"count-{config['num_bits']}"
+    return arm
+
+
 def _read(log: Path) -> Iterator[Row]:
     config = read_json(log.parent / "config.json")
     lines = log.read_text().splitlines(keepends=True)
@@ -71,13 +82,10 @@ def _read(log: Path) -> Iterator[Row]:
 
 
 def _row(data: dict[str, Any], config: dict[str, Any], run: Path) -> Row:
-    arm = data["arm"]
-    if arm == "count" and "num_bits" in config:
-        arm = f"count-{config['num_bits']}"
     exploring = data["phase"] == "explore"
     return Row(
         preset=config["preset"],
-        arm=arm,
+        arm=label(data["arm"], config),
         phase=data["phase"],
         seed=int(data["seed"]),
         task="" if exploring else data["task"],

@@ -14,7 +14,16 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import acting, checkpoint, devices, hosts, loop, records, rundir
+from experiments import (
+    acting,
+    checkpoint,
+    coverage,
+    devices,
+    hosts,
+    loop,
+    records,
+    rundir,
+)
 from experiments.acting import Tick, Trials
 from experiments.build import (
     EXPLORE,
@@ -65,7 +74,12 @@ def explore(config: Config, folder: Path, say: Say) -> None:
     own = Loop(
         "explore", config.trial_length, spread, (SEED,), keys, act, learn, labels
     )
-    loop.run(config, folder, own, init, 0, config.num_trials, say)
+    trials = loop.run(config, folder, own, init, 0, config.num_trials, say)
+    data = data_of(explored_template(config, parts))
+    last, anew = config.num_trials, trials is not None
+    hosts.on_first(
+        lambda: coverage.write(folder, config.seeds, data, last, anew=anew, warn=say)
+    )
 
 
 def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -> None:
@@ -210,6 +224,11 @@ def explored_template(config: Config, parts: Parts) -> State:
 def model_of(state: State) -> State:
     """Returns what planning needs of a learner, with nothing in the other places."""
     return jax.tree.map(lambda _: None, state)._replace(params=state.params)
+
+
+def data_of(state: State) -> State:
+    """Returns the dataset of a learner, with nothing in the other places."""
+    return jax.tree.map(lambda _: None, state)._replace(dataset=state.dataset)
 
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:

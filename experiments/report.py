@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import figures, stats, tables
+from experiments import coverage, data_sections, figures, stats, tables
+from experiments.coverage import Counts
 from experiments.figures import Curve, TaskPanels
 from experiments.logs import (
     Points,
@@ -48,6 +49,7 @@ class _Files(NamedTuple):
     table_1: Path
     figure_4: Path
     exploration: Path
+    coverage: Path  # only if a run has its coverage
 
 
 def write_report(out: Path, target: Path) -> list[Path]:
@@ -57,16 +59,17 @@ def write_report(out: Path, target: Path) -> list[Path]:
     under these names, the others with the preset in the name.
 
     Args:
-      out: holds runs at any depth.
+      out: holds runs at any depth, and model_error.json if there is one.
       target: folder to write into; made if it is not there.
 
     Returns:
       The files written.
 
     Raises:
-      UsageError: as `load`.
+      UsageError: as `load`, for coverage.json and model_error.json too.
     """
     rows = load(out)
+    seen = coverage.load(out)
     target.mkdir(parents=True, exist_ok=True)
     presets = {row.preset for row in rows}
     written: list[Path] = []
@@ -79,13 +82,17 @@ def write_report(out: Path, target: Path) -> list[Path]:
             table_1=target / f"table1{suffix}.json",
             figure_4=target / f"figure4{suffix}.png",
             exploration=target / f"exploration{suffix}.png",
+            coverage=target / f"coverage{suffix}.png",
         )
-        _write([row for row in rows if row.preset == preset], out, files)
-        written += files
+        counts = seen.get(preset, {})
+        _write([row for row in rows if row.preset == preset], counts, out, files)
+        written += files if counts else files[:-1]
     return written
 
 
-def _write(rows: Sequence[Row], out: Path, files: _Files) -> None:
+def _write(
+    rows: Sequence[Row], counts: Mapping[str, Counts], out: Path, files: _Files
+) -> None:
     """Writes the files of one preset."""
     explored = _explored(rows)
     found = scores(rows, explored)
@@ -117,6 +124,8 @@ def _write(rows: Sequence[Row], out: Path, files: _Files) -> None:
         "",
         "The arms value different things; compare their turns, not their values.",
         "",
+        *data_sections.covered(counts, files.coverage),
+        *data_sections.model_error(out / "model_error.json", rows[0].preset),
         *_ablation(out / "ablation.jsonl"),
         *_runs(rows, out),
     ]

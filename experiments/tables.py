@@ -159,6 +159,42 @@ def ablation(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     return table(["exploration", "refit", "search", "seeds", *TASKS], lines)
 
 
+def measures(by_arm: Mapping[str, Mapping[int, Mapping[str, float]]]) -> list[str]:
+    """Returns any measures of seeds: arms by measures, which all seeds have."""
+    columns = list(
+        dict.fromkeys(x for s in by_arm.values() for m in s.values() for x in m)
+    )
+    rows = [
+        [arm, *(cell({seed: m[name] for seed, m in seeds.items()}) for name in columns)]
+        for arm, seeds in by_arm.items()
+    ]
+    return table(["arm", *columns], rows)
+
+
+def pairs(by_model: Mapping[str, Mapping[str, Mapping[str, Any] | None]]) -> list[str]:
+    """Returns a measure of models on data: the model's arm by the data's arm.
+
+    Args:
+      by_model: by both arms the mean, std and number of pairs, or None without a pair;
+        None for a number is one that is not finite.
+    """
+    arms = in_order(by_model)
+    rows = [
+        [model, *(_pairs(by_model[model][data]) for data in arms)] for model in arms
+    ]
+    return table(["model of", *(f"data of {arm}" for arm in arms)], rows)
+
+
+def _pairs(entry: Mapping[str, Any] | None) -> str:
+    if entry is None:
+        return "no pair"
+    if entry["mean"] is None:
+        return "not finite"
+    spread = "" if entry["std"] is None else f" ± {entry['std']:.2g}"
+    count = "1 pair" if entry["pairs"] == 1 else f"{entry['pairs']} pairs"
+    return f"{entry['mean']:.3g}{spread} ({count})"
+
+
 def seconds(by_run: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     """Returns the median seconds of a trial by run; an item per trial."""
     rows = []

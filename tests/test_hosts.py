@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import runs
 
-from experiments import checkpoint, cli
+from experiments import checkpoint, cli, coverage
 from experiments.hosts import Place
 from experiments.run import main
 
@@ -146,6 +146,7 @@ def test_only_the_first_host_has_a_folder(found):
     assert found.folder.is_dir() and not found.other.exists()
     status = json.loads((found.folder / "status.json").read_text())
     assert status["state"] == "complete"
+    assert list(coverage.load(found.folder)["smoke"]["epistemic"]) == [0, 1]
 
 
 @pytest.mark.slow
