@@ -170,8 +170,8 @@ _SMOKE_PLANNER = PlannerNumbers(
     precision="f32",
 )
 # The laptop plans about 20,000 and not 1,500,000 model steps an action with a network a
-# third as large, and trains longer on the little data there is. Many short trials beat
-# few long ones.
+# third as large, and trains longer on the little data there is, so that nothing is left
+# for a refit. Many short trials beat few long ones.
 PRESETS = {
     "paper": Config(tyro.MISSING, preset="paper"),
     "laptop": Config(
@@ -186,7 +186,7 @@ PRESETS = {
         milestones=(),
         model=ModelNumbers(hidden_size=128, num_layers=3),
         training=TrainingNumbers(20, 64, 2e-3),
-        refit=TrainingNumbers(100, 64, 2e-3, final_rate=0.005),
+        refit=TrainingNumbers(0),
         tuning=TrainingNumbers(20, 64, 2e-3, final_rate=0.02),
         planner=_LAPTOP_PLANNER,
         task_planner=dataclasses.replace(_LAPTOP_PLANNER, noise_beta=0.5),
