@@ -25,12 +25,13 @@ LAST, STEPS = 3, 20
 
 def start(*command, devices=1, variables=()):
     """Starts Python in a process of its own; all share what they compile."""
+    flags = f"--xla_force_host_platform_device_count={devices}"
     env = {
         "PYTHONPATH": str(Path(cli.__file__).resolve().parents[1]),
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}",
     }
     return subprocess.Popen(
         [sys.executable, *map(str, command)],
