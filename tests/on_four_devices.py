@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import runs
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
@@ -90,7 +91,7 @@ def report(out, one_seed, unfinished):
     codes = [
         main([*four, str(out / "four")]),
         main([*four, str(unfinished.parent)]),
-        main(["--phase", "zero-shot", "--from", str(one_seed)]),
+        main(["--phase", "zero-shot", "--from", str(one_seed), *runs.REFIT]),
     ]
     spread_over, said = acting_program([*four, str(out / "four")])
     flags = ["--tiny", "--precision", "f32", "--repeats", "2", "--devices", "2", "64"]

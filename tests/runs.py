@@ -21,6 +21,7 @@ from experiments.run import main
 NAME = "smoke-epistemic"
 EXPLORED = ("--phase", "explore", "--preset", "smoke", "--engine", "mujoco")
 LAST, STEPS = 3, 20
+REFIT = ("--refit.num-epochs", "1", "--refit.batch-size", "16")
 
 
 def start(*command, devices=1, variables=()):

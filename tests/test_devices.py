@@ -163,13 +163,13 @@ def test_a_run_goes_on_with_another_number_of_devices(found, name):
 
 @pytest.mark.slow
 def test_tasks_of_one_seed_are_spread(found, tmp_path):
-    """Restored from a run on one device; the same zero-shot returns as there."""
+    """Restored from a run on one device and refit; the same returns as there."""
     assert found.seen["tasks"] == [1, 4, 1]
     spread = found.alone / TASKS
     shutil.copytree(found.alone, tmp_path / runs.NAME)
     here = tmp_path / runs.NAME / TASKS
     shutil.rmtree(here)
-    assert main(["--phase", "zero-shot", "--from", str(here.parent)]) == 0
+    assert main(["--phase", "zero-shot", "--from", str(here.parent), *runs.REFIT]) == 0
     for row, other in zip(runs.rows(spread), runs.rows(here), strict=True):
         assert row["task"] == other["task"]
         close(row, other, rel=1e-2, abs=1e-2)

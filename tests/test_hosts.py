@@ -151,14 +151,15 @@ def test_only_the_first_host_has_a_folder(found):
 
 @pytest.mark.slow
 def test_tasks_of_one_seed_are_spread_over_hosts(found, tmp_path):
-    """The model comes from process 0; the returns are those of one process."""
+    """The model comes from process 0 and is refit; one process has the same returns."""
     outs = tmp_path / "first", tmp_path / "second"
     for out in outs[0], tmp_path / "one":
         shutil.copytree(found.alone, out / runs.NAME)
-    codes, said = finish(start(outs, "--phase", "zero-shot", "--preset", "smoke"))
+    command = ("--phase", "zero-shot", "--preset", "smoke", *runs.REFIT)
+    codes, said = finish(start(outs, *command))
     assert codes == [0, 0], said
     one = tmp_path / "one" / runs.NAME
-    assert main(["--phase", "zero-shot", "--from", str(one)]) == 0
+    assert main(["--phase", "zero-shot", "--from", str(one), *runs.REFIT]) == 0
     spread, whole = outs[0] / runs.NAME / TASKS, one / TASKS
     for row, other in zip(runs.rows(spread), runs.rows(whole), strict=True):
         assert row["task"] == other["task"]

@@ -17,7 +17,6 @@ SMALL = (
     "--task-planner.num-elites", "2", "--task-planner.num-iterations", "2",
     "--task-planner.num-particles", "15",
 )  # fmt: skip
-REFIT = ("--refit.num-epochs", "2", "--refit.batch-size", "16")
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,15 @@ def explored(tmp_path_factory):
         "precision": planner.precision,
     }
     flags = [x for f, v in search.items() for x in (f"--task-planner.{f}", v)]
-    command = ["--phase", "zero-shot", "--from", str(folder), *SMALL, *REFIT, *flags]
+    command = [
+        "--phase",
+        "zero-shot",
+        "--from",
+        str(folder),
+        *SMALL,
+        *runs.REFIT,
+        *flags,
+    ]
     assert main(command) == 0
     return folder
 
