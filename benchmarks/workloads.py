@@ -46,7 +46,7 @@ def named_size(name: str) -> Size:
         return Size(16, 4, 2, 3, 5, hidden_sizes=(8, 8, 8, 8))
     if name == "paper":
         return Size()
-    from experiments.config import PRESETS  # needs the extra `experiments`
+    from experiments.presets import PRESETS  # needs the extra `experiments`
 
     numbers = PRESETS["laptop"]
     planner, network = numbers.planner, numbers.model

@@ -12,9 +12,10 @@ from typing import Any
 import tyro
 
 from experiments import rundir
-from experiments.config import PRESETS, Config, numbers_of, ranges, validate
+from experiments.config import Config, ranges, validate
 from experiments.errors import CheckpointError, UsageError
 from experiments.hosts import Place
+from experiments.presets import PRESETS, numbers_of
 
 # Explored models that come with the code; see `experiments.pretrained`.
 PRETRAINED = Path(__file__).parents[1] / "results" / "pretrained"

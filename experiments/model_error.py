@@ -27,8 +27,9 @@ from jax import Array
 import jaxpets
 from experiments import checkpoint, cli, logs, phases, rundir, tables
 from experiments.build import build
-from experiments.config import PRESETS, Config
+from experiments.config import Config
 from experiments.errors import RunError, UsageError
+from experiments.presets import PRESETS
 from jaxpets.envs import half_cheetah
 
 # `Ensemble.predict`.

@@ -18,8 +18,9 @@ import jax
 
 from experiments import checkpoint, cli, phases, rundir
 from experiments.build import build
-from experiments.config import PRESETS, PRETRAINED_PLANNER, Config
+from experiments.config import Config
 from experiments.errors import RunError, UsageError
+from experiments.presets import PRESETS, PRETRAINED_PLANNER
 
 
 def ship(run: Path, name: str, seed: int | None = None) -> Path:

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from experiments import cli, hosts, session
-from experiments.config import PRESETS, Config
+from experiments.config import Config
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -17,6 +17,7 @@ from experiments.errors import (
     StorageError,
     UsageError,
 )
+from experiments.presets import PRESETS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,7 +18,8 @@ import tyro
 import jaxpets
 from experiments import acting, rundir
 from experiments.build import ENGINES, optimizer
-from experiments.config import PRETRAINED_PLANNER, EngineName, PlannerNumbers
+from experiments.config import EngineName, PlannerNumbers
+from experiments.presets import PRETRAINED_PLANNER
 from jaxpets.envs import env_rollout, half_cheetah
 
 

@@ -122,7 +122,7 @@ def test_plan_over_seeds_and_samples(tmp_path):
 
 
 def test_laptop_is_the_preset_of_the_experiments():
-    from experiments.config import PRESETS
+    from experiments.presets import PRESETS
 
     planner = PRESETS["laptop"].planner
     size = workloads.named_size("laptop")

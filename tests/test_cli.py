@@ -6,8 +6,9 @@ import json
 import pytest
 
 from experiments import cli
-from experiments.config import PRESETS, Config
+from experiments.config import Config
 from experiments.errors import CheckpointError
+from experiments.presets import PRESETS
 from experiments.run import main
 
 SMOKE = ("--phase", "explore", "--preset", "smoke")

@@ -16,7 +16,7 @@ from c_mujoco import c_step, visited_states
 
 import jaxpets
 from experiments.build import build
-from experiments.config import PRESETS
+from experiments.presets import PRESETS
 from jaxpets.envs import env_rollout, native
 from jaxpets.envs import half_cheetah as hc
 

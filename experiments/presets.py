@@ -1,0 +1,87 @@
+"""The presets: the paper's numbers, a laptop's, and seconds for tests."""
+
+import dataclasses
+
+import tyro
+
+from experiments.config import (
+    ArmName,
+    Config,
+    ModelNumbers,
+    PlannerNumbers,
+    Preset,
+    TrainingNumbers,
+)
+
+_LAPTOP_PLANNER = PlannerNumbers(
+    optimizer="icem",
+    horizon=15,
+    num_samples=64,
+    num_elites=8,
+    num_iterations=3,
+    num_particles=5,
+    noise_beta=1.0,
+    precision="f32",
+)
+_SMOKE_PLANNER = PlannerNumbers(
+    horizon=3,
+    num_samples=8,
+    num_elites=2,
+    num_iterations=2,
+    num_particles=3,
+    precision="f32",
+)
+# The laptop plans about 20,000 and not 1,500,000 model steps an action with a network a
+# third as large, and trains longer on the little data there is, so that nothing is left
+# for a refit. Many short trials beat few long ones.
+PRESETS = {
+    "paper": Config(tyro.MISSING, preset="paper"),
+    "laptop": Config(
+        tyro.MISSING,
+        preset="laptop",
+        num_trials=48,
+        trial_length=250,
+        task_length=500,
+        eval_trials=3,
+        finetune_trials=3,
+        chunk_length=10,
+        milestones=(),
+        model=ModelNumbers(hidden_size=128, num_layers=3),
+        training=TrainingNumbers(20, 64, 2e-3),
+        refit=TrainingNumbers(0),
+        tuning=TrainingNumbers(20, 64, 2e-3, final_rate=0.02),
+        planner=_LAPTOP_PLANNER,
+        task_planner=dataclasses.replace(_LAPTOP_PLANNER, noise_beta=0.5),
+    ),
+    "smoke": Config(
+        tyro.MISSING,
+        preset="smoke",
+        num_trials=3,
+        trial_length=20,
+        task_length=20,
+        eval_trials=1,
+        finetune_trials=2,
+        chunk_length=10,
+        milestones=(),
+        model=ModelNumbers(num_members=3, hidden_size=16, num_layers=2),
+        training=TrainingNumbers(1, 16),
+        refit=TrainingNumbers(0),
+        tuning=TrainingNumbers(1, 16),
+        planner=_SMOKE_PLANNER,
+        task_planner=_SMOKE_PLANNER,
+    ),
+}
+
+
+# What models that come with the code perform with: the laptop's search, further ahead.
+PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
+# How `best` searches when it performs: in noise that keeps its direction for a while.
+_BEST_SEARCH = dataclasses.replace(PlannerNumbers(), optimizer="icem", noise_beta=0.5)
+
+
+def numbers_of(preset: Preset, arm: ArmName) -> Config:
+    """Returns the numbers to start from; `best` brings its own search to `paper`."""
+    config = PRESETS[preset]
+    if (preset, arm) == ("paper", "best"):
+        config = dataclasses.replace(config, task_planner=_BEST_SEARCH)
+    return config
