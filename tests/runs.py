@@ -14,8 +14,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from experiments import checkpoint, cli
-from experiments.build import EXPLORE, LEARNER_AXES, build, trial_keys
+from experiments import checkpoint, cli, phases
+from experiments.build import build
 from experiments.run import main
 
 NAME = "smoke-epistemic"
@@ -67,11 +67,10 @@ def numbers(row):
     return own | row["returns"] | row.get("fit", {})
 
 
-def learner(folder, step=LAST):
-    """Restores the learner of an exploration run."""
+def learner(folder, step=None):
+    """Restores the learner of an exploration run, by default the newest."""
     config = cli.parse(["--phase", "zero-shot", "--from", str(folder)])
-    init = jax.vmap(build(config).learner.init, out_axes=LEARNER_AXES)
-    template = jax.eval_shape(init, trial_keys(config, EXPLORE, 0))
+    template = phases.explored_template(config, build(config))
     found = checkpoint.restore(
         folder / "checkpoints", template, step=step, warn=pytest.fail
     )

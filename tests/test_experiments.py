@@ -14,9 +14,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from runs import learner, rows
 
 from experiments import checkpoint, cli, rundir
-from experiments.build import EXPLORE, LEARNER_AXES, build, trial_keys
 from experiments.run import main
 from jaxpets.envs import half_cheetah
 
@@ -66,23 +66,6 @@ def again(straight, tmp_path):
     """A copy of that run."""
     shutil.copytree(straight[0], tmp_path / NAME)
     return tmp_path / NAME
-
-
-def learner(folder, step=None):
-    """Restores the learner of an exploration run, as NumPy leaves."""
-    config = cli.parse(["--phase", "zero-shot", "--from", str(folder)])
-    init = jax.vmap(build(config).learner.init, out_axes=LEARNER_AXES)
-    template = jax.eval_shape(init, trial_keys(config, EXPLORE, 0))
-    found = checkpoint.restore(
-        folder / "checkpoints", template, step=step, warn=pytest.fail
-    )
-    assert found is not None
-    return found[1]
-
-
-def rows(folder):
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    return [json.loads(line) for line in lines]
 
 
 def untimed(folder):
