@@ -73,18 +73,19 @@ def build(config: Config) -> Parts:
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
 
-    steps = config.trial_length, config.task_length
-    refits = config.refit.num_epochs > 0
-
     return Parts(
         env=env,
         model=trained,
         random=random,
         explorer=planner(arm.reward_fn, config.planner) if arm.reward_fn else random,
         actor=planner(half_cheetah.task_reward, config.task_planner),
-        learner=learner(config.training, arm.reward_data, steps[0], explored),
-        refitter=_fitter(trained, config.refit) if refits else None,
-        finetuner=learner(config.tuning, NO_DATA, steps[1], explored + finetuned),
+        learner=learner(
+            config.training, arm.reward_data, config.trial_length, explored
+        ),
+        refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
+        finetuner=learner(
+            config.tuning, NO_DATA, config.task_length, explored + finetuned
+        ),
     )
 
 
