@@ -21,8 +21,8 @@ class PseudoCounts(NamedTuple):
     projection: Array  # [k, D]
     mean: Array  # [D]
     std: Array  # [D]
-    codes: Array  # [C] uint32, sorted; the first `size` are real, the rest padding
-    size: Array  # [] int32
+    codes: Array  # [C] uint32, sorted, padding among them
+    visits: Array  # [C] int32, how many states have the code
 
 
 def simhash(key: Array, num_bits: int, obs_size: int) -> Array:
@@ -70,7 +70,11 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
     codes = _hash(projection, mean, std, obs)
     # Padding sorts behind or among equal real codes, and is cut off when counting.
     codes = jnp.sort(jnp.where(used, codes, jnp.uint32(0xFFFFFFFF)))
-    return PseudoCounts(projection, mean, std, codes, dataset.size)
+    first, last = (
+        jnp.minimum(jnp.searchsorted(codes, codes, side=side), dataset.size)
+        for side in ("left", "right")
+    )
+    return PseudoCounts(projection, mean, std, codes, last - first)
 
 
 def lookup(counts: PseudoCounts, obs: Array) -> Array:
@@ -85,9 +89,11 @@ def lookup(counts: PseudoCounts, obs: Array) -> Array:
     """
     check_array("obs", obs, ["...", counts.mean.shape[0]])
     code = _hash(counts.projection, counts.mean, counts.std, obs)
-    first = jnp.searchsorted(counts.codes, code, side="left")
-    last = jnp.searchsorted(counts.codes, code, side="right")
-    return jnp.minimum(last, counts.size) - jnp.minimum(first, counts.size)
+    # Unrolled, the steps of the search can be one program. Every particle of every
+    # candidate comes through here.
+    at = jnp.searchsorted(counts.codes, code, method="scan_unrolled")
+    at = jnp.minimum(at, counts.codes.size - 1)
+    return jnp.where(counts.codes[at] == code, counts.visits[at], 0)
 
 
 def pseudo_count(
