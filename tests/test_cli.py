@@ -263,11 +263,12 @@ def test_the_paper_preset_has_the_numbers_of_the_paper():
     assert isinstance(paper, Config)
 
 
-def test_best_is_the_paper_with_another_search_for_tasks():
+def test_best_is_the_paper_with_another_refit_and_search_for_tasks():
     flags = ["--phase", "explore", "--preset", "paper"]
     plain, best = cli.parse(flags), cli.parse([*flags, "--arm", "best"])
     assert best.task_planner.optimizer == "icem"
-    changed = {"arm": "best", "task_planner": best.task_planner}
+    assert best.refit.num_epochs == 800
+    changed = {name: getattr(best, name) for name in ("arm", "refit", "task_planner")}
     assert best == dataclasses.replace(plain, **changed)
     flags += ["--arm", "best", "--task-planner.horizon", "20"]
     assert cli.parse(flags).task_planner.horizon == 20
