@@ -16,6 +16,11 @@ _NOT_SETTINGS = {
     "video", "milestones", "allow_cpu", "debug", "chunk_length", "eval_trials",
     "num_trials", "finetune_trials", "num_bits",
 }  # fmt: skip
+# What a phase keeps in its config for the phases after it.
+_FOR_LATER = {
+    "explore": {"task_length", "refit", "tuning", "task_planner"},
+    "zero-shot": {"tuning"},
+}
 
 
 def notes(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
@@ -126,13 +131,17 @@ def _torn(runs: Iterable[Path]) -> Iterator[str]:
 def _unequal(runs: dict[Path, str]) -> Iterator[str]:
     """Says which settings differ between runs of a phase that share a table."""
     for phase in sorted(set(runs.values())):
-        values: dict[str, dict[str, list[str]]] = {}
+        skipped = _NOT_SETTINGS | _FOR_LATER.get(phase, set())
+        values: dict[str, dict[str, set[str]]] = {}
         for run in sorted(run for run in runs if runs[run] == phase):
             for name, value in flat(read_json(run / "config.json")).items():
-                if name.split(".")[0] not in _NOT_SETTINGS:
+                if name.split(".")[0] not in skipped:
                     label = run.parent.name if phase != "explore" else run.name
-                    values.setdefault(name, {}).setdefault(str(value), []).append(label)
+                    by_value = values.setdefault(name, {})
+                    by_value.setdefault(str(value), set()).add(label)
         for name, by_value in values.items():
             if len(by_value) > 1:
-                each = "; ".join(f"{v} ({_list(r)})" for v, r in by_value.items())
+                each = "; ".join(
+                    f"{v} ({_list(sorted(r))})" for v, r in by_value.items()
+                )
                 yield f"Unequal settings in {phase}: {name} is {each}."

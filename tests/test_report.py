@@ -233,6 +233,14 @@ def test_runs_of_other_seeds_are_pooled(out):
     assert "learning_rate is 0.1 (laptop-epistemic); 0.5 (more)" in text
 
 
+def test_what_a_phase_does_not_use_may_differ_in_it(tmp_path):
+    for arm, horizon in (("epistemic", 20), ("best", 30)):
+        write_arm(tmp_path / "runs", arm, [1.0], task_planner={"horizon": horizon})
+    text, _ = report_of(tmp_path / "runs")
+    assert "Unequal settings in zero-shot: task_planner.horizon is" in text
+    assert "Unequal settings in explore" not in text
+
+
 def test_a_seed_in_two_runs_is_an_error(out):
     rows = zero_shot_rows("epistemic", [1.0])
     write_run(out / "again" / "zero-shot", rows, phase="zero-shot", arm="epistemic")
