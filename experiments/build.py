@@ -63,6 +63,9 @@ def build(config: Config) -> Parts:
     def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
         return jaxpets.plan(_rollout(size, search), reward_fn, optimizer(search, env))
 
+    reward = half_cheetah.task_reward
+    if config.pessimism:
+        reward = jaxpets.rewards.pessimistic(reward, config.pessimism)
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
     def learner(
@@ -78,7 +81,7 @@ def build(config: Config) -> Parts:
         model=trained,
         random=random,
         explorer=planner(arm.reward_fn, config.planner) if arm.reward_fn else random,
-        actor=planner(half_cheetah.task_reward, config.task_planner),
+        actor=planner(reward, config.task_planner),
         learner=learner(
             config.training, arm.reward_data, config.trial_length, explored
         ),

@@ -130,6 +130,8 @@ class Config:
     engine: EngineName = "mjx"
     """What steps the physics: mjx on the device of the program, or mujoco, which is C
     on the cores of the host."""
+    pessimism: float = number(0.0, 0.0, 100.0)
+    """Performing: standard deviations between members taken off a task's reward."""
     num_bits: int = number(32, 1, 32)
     """count: bits of the hash."""
     coordinator_address: str | None = None
@@ -173,6 +175,12 @@ def validate(config: Config) -> None:
         "--model.num-members",
         members,
         f"2 or more for --arm {config.arm}; one member never disagrees",
+    )
+    _require(
+        members >= 2 or not config.pessimism,
+        "--pessimism",
+        config.pessimism,
+        "0 with one member; it never disagrees",
     )
     random, trials = config.random_trials, config.num_trials
     valid = f"1 to --num-trials ({trials})"

@@ -11,6 +11,7 @@ from jaxpets._src.rewards import (
     epistemic,
     information_gain,
     one_step_disagreement,
+    pessimistic,
 )
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "information_gain",
     "lookup",
     "one_step_disagreement",
+    "pessimistic",
     "pseudo_count",
     "simhash",
 ]

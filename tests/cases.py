@@ -131,6 +131,10 @@ CASES = {
         jaxpets.rewards.one_step_disagreement(MODEL.predict),
         lambda i: (model(i), *step_of(i)),
     ),
+    "pessimistic": lambda: Case(
+        jaxpets.rewards.pessimistic(toys.reach, 0.5),
+        lambda i: (jnp.float32(i), *step_of(i)),
+    ),
     "task_reward": lambda: Case(
         hc.task_reward,
         lambda i: (jax.tree.map(lambda x: x[i], hc.tasks()), *step_of(i, 18, 6)),

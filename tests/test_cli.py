@@ -91,6 +91,10 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
             (*SMOKE, "--model.num-members", "1"),
             ["--model.num-members 1", "2 or more for --arm epistemic"],
         ),
+        (
+            (*SMOKE, "--arm", "random", "--model.num-members", "1", "--pessimism", "1"),
+            ["--pessimism 1.0", "0 with one member"],
+        ),
         ((*SMOKE, "--random-trials", "4"), ["--random-trials 4", "--num-trials (3)"]),
         ((*SMOKE, "--chunk-length", "7"), ["--chunk-length 7", "divisor", "(20)"]),
         ((*SMOKE, "--num-bits", "33"), ["--num-bits 33", "1 to 32"]),

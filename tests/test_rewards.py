@@ -6,7 +6,12 @@ import reference
 import toys
 
 import jaxpets
-from jaxpets.rewards import epistemic, information_gain, one_step_disagreement
+from jaxpets.rewards import (
+    epistemic,
+    information_gain,
+    one_step_disagreement,
+    pessimistic,
+)
 
 E, P, D = 5, 4, 6
 
@@ -188,6 +193,48 @@ def test_one_step_disagreement_refuses_what_does_not_fit():
         fn(params, jnp.zeros((1, P, D)), jnp.ones(2), jnp.zeros((1, P, D)))
     with pytest.raises(ValueError, match=r"obs must be float32\[E, P, D\], got"):
         fn(params, jnp.zeros((P, D)), jnp.ones(2), jnp.zeros((P, D)))
+
+
+# -- pessimism -------------------------------------------------------------------------
+
+
+def first(scale, obs, action, next_obs):
+    return scale * next_obs[..., 0] - jnp.sum(action**2)
+
+
+@pytest.mark.parametrize("caution", [0.0, 0.7])
+def test_pessimistic_equals_the_reference(caution):
+    states, _ = particles()
+    step = (jnp.zeros((E, P, D)), jnp.ones(2), jnp.asarray(states))
+    got = pessimistic(first, caution)(jnp.float32(3), *step)
+    by_member = (3 * np.float64(states)[..., 0] - 2).mean(1)
+    assert got.shape == ()
+    np.testing.assert_allclose(
+        got, by_member.mean() - caution * by_member.std(), rtol=1e-5
+    )
+
+
+def test_a_pessimist_prefers_what_the_members_agree_on():
+    """Of two rewards the larger wins, unless its members disagree."""
+    sure, unsure = np.zeros((2, E, P, D), np.float32)
+    sure[..., 0], unsure[..., 0] = 1.0, 1.5 + np.arange(-2, 3)[:, None]
+    values = [
+        [pessimistic(first, c)(1.0, s, jnp.zeros(2), s) for s in (sure, unsure)]
+        for c in (0.0, 1.0)
+    ]
+    assert values[0][0] < values[0][1] and values[1][0] > values[1][1]
+
+
+def test_pessimistic_refuses_what_does_not_fit():
+    states, base = particles()
+    for caution in (-0.1, np.inf, np.nan):
+        with pytest.raises(ValueError, match="caution must be finite and at least 0"):
+            pessimistic(first, caution)
+    step = (jnp.asarray(states), jnp.zeros(2), jnp.asarray(states))
+    with pytest.raises(ValueError, match=r"reward must be float32\[5, 4\], got"):
+        pessimistic(epistemic, 1.0)(base, *step)
+    with pytest.raises(ValueError, match="at least 2 members, got 1"):
+        pessimistic(first, 1.0)(1.0, states[:1], jnp.zeros(2), states[:1])
 
 
 def test_namespace_lists_what_it_has():

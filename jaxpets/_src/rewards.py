@@ -1,5 +1,6 @@
-"""Rewards that seek what the ensemble does not know."""
+"""Rewards that seek, or shun, what the ensemble does not know."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -89,6 +90,38 @@ def one_step_disagreement(
         mean, variance = predict_fn(params, shared, actions)
         ratio = jnp.var(mean, axis=0) / jnp.mean(variance, axis=0)
         return jnp.mean(jnp.sqrt(ratio), -1).reshape(num_members, per_member)
+
+    return reward
+
+
+def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
+    """Builds a reward that trusts the members less the less they agree on it.
+
+    `r = mean_e r_e - caution * std_e r_e`, with `r_e` the mean of reward_fn over the
+    particles of member e. A search finds where a model errs in its favour; members that
+    were trained apart seldom err alike.
+
+    Args:
+      reward_fn: returns `[E, P]`, not a set already reduced.
+      caution: standard deviations to take off, 0 or more.
+
+    Returns:
+      A RewardFn that returns `[]`, with the params and units of reward_fn. It raises
+      ValueError if the shapes do not fit, or there is only one member.
+
+    Raises:
+      ValueError: if caution is negative or not finite.
+    """
+    if not 0 <= caution < math.inf:
+        raise ValueError(f"caution must be finite and at least 0, got {caution}.")
+
+    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        check_array("next_obs", next_obs, ["E", "P", "D"])
+        _check_members(next_obs.shape[0])
+        rewards = reward_fn(params, obs, action, next_obs)
+        check_array("reward", rewards, [*next_obs.shape[:2]])
+        by_member = jnp.mean(rewards, axis=1)
+        return jnp.mean(by_member) - caution * jnp.std(by_member)
 
     return reward
 
