@@ -75,8 +75,14 @@ def explored_run(config: Config) -> Path:
 
 
 def results_folder(config: Config) -> Path:
-    """Returns where later phases put theirs: the run they start from, if it is ours."""
+    """Returns where later phases put theirs: the run they start from, if it is ours.
+
+    With --from, --name gives them a folder of their own: a run can perform again with
+    other numbers.
+    """
     source = explored_run(config)
+    if config.source is not None and config.name is not None:
+        return config.out.resolve() / config.name
     if source.parent != PRETRAINED.resolve():
         return source
     return config.out.resolve() / f"pretrained-{source.name}"
@@ -225,7 +231,9 @@ def _explored(first: argparse.Namespace, default: Config) -> Config:
             "name a run with --from."
         )
     explored = from_json(rundir.read_json(path), default)
-    return dataclasses.replace(explored, **dict.fromkeys(_PLACE))
+    return dataclasses.replace(
+        explored, out=Path(first.out), name=first.name, **dict.fromkeys(_PLACE)
+    )
 
 
 def _tyro(argv: Sequence[str], default: Config) -> Config:

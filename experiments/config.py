@@ -104,7 +104,8 @@ class Config:
     out: Path = Path("runs")
     """Folder of all runs."""
     name: str | None = None
-    """Name of the exploration run; by default PRESET-ARM."""
+    """Name of the exploration run; by default PRESET-ARM. With --from, of the folder in
+    OUT for the results; by default that of the run."""
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Exploration run for zero-shot and finetune; by default OUT/NAME."""
     at_trial: int | None = None

@@ -180,6 +180,17 @@ def test_from_names_a_run_anywhere(out):
     assert cli.explored_run(config) == path.parent
 
 
+def test_results_have_a_folder_of_their_own_if_it_is_named(out):
+    run = explored(out, name="mine").parent
+    start = ["--phase", "zero-shot", "--from", str(run)]
+    assert cli.results_folder(cli.parse(start)) == run
+    config = cli.parse([*start, "--out", str(out / "b"), "--name", "again"])
+    assert cli.explored_run(config) == run
+    assert cli.results_folder(config) == out / "b" / "again"
+    here = cli.parse([*LATER, "--out", str(out), "--name", "mine"])
+    assert cli.explored_run(here) == cli.results_folder(here) == run
+
+
 def test_a_run_keeps_its_labels(fail, out):
     path = explored(out, name="mine", arm="count")
     start = ("--phase", "zero-shot", "--from", str(path.parent))
