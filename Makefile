@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs
 PYTEST_FLAGS ?=
 
-.PHONY: explore test lint clean
+.PHONY: explore results test lint clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -17,6 +17,12 @@ explore: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase explore --out $(OUT)
 	$(BIN)/python -m experiments.run --phase zero-shot --out $(OUT) --video $(OUT)/cheetah.mp4
 	$(BIN)/python -m experiments.run --phase report --out $(OUT)
+
+# The reports on the runs at paper scale, from their logs.
+results: $(VENV)/.installed
+	$(BIN)/python -m experiments.run --phase report --out results/paper
+	$(BIN)/python -m experiments.run --phase report --out results/paper-no-refit
+	cp results/paper/report/table1.json results/table1.json
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)
