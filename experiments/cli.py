@@ -4,15 +4,16 @@ import argparse
 import contextlib
 import dataclasses
 import io
+import operator
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import tyro
 
 from experiments import rundir
-from experiments.config import Config, ranges, validate
+from experiments.config import Config, TaskName, ranges, validate
 from experiments.errors import CheckpointError, UsageError
 from experiments.hosts import Place
 from experiments.presets import PRESETS, numbers_of
@@ -23,7 +24,13 @@ PRETRAINED = Path(__file__).parents[1] / "results" / "pretrained"
 _PLACE = Place._fields
 # Where a run that is continued may differ from its start.
 CONTINUED = (
-    "out", "name", "video", "allow_cpu", "debug", "chunk_length", "source", *_PLACE,
+    "out", "name", "video", "allow_cpu", "debug", "chunk_length", "source", "at_trial",
+    *_PLACE,
+)  # fmt: skip
+# What an explored model is; the names of sizes are those of flags.
+_OF_THE_RUN = (
+    "preset", "arm", "seeds", "num_bits", "num_trials", "trial_length",
+    "model.num_members", "model.hidden_size", "model.num_layers",
 )  # fmt: skip
 
 
@@ -38,8 +45,8 @@ def parse(argv: Sequence[str]) -> Config:
       SystemExit: after `--help`.
     """
     first = _first_flags(argv)
-    if first.name is not None:
-        _check_name(first.name)
+    for flag in ("name", "tag"):
+        _check_name(flag, getattr(first, flag))
     default = numbers_of(first.preset, first.arm)
     if first.phase in ("zero-shot", "finetune"):
         _tyro(argv, default)  # what is wrong with the flags comes before the run
@@ -75,14 +82,8 @@ def explored_run(config: Config) -> Path:
 
 
 def results_folder(config: Config) -> Path:
-    """Returns where later phases put theirs: the run they start from, if it is ours.
-
-    With --from, --name gives them a folder of their own: a run can perform again with
-    other numbers.
-    """
+    """Returns where later phases put theirs: the run they start from, if it is ours."""
     source = explored_run(config)
-    if config.source is not None and config.name is not None:
-        return config.out.resolve() / config.name
     if source.parent != PRETRAINED.resolve():
         return source
     return config.out.resolve() / f"pretrained-{source.name}"
@@ -182,7 +183,7 @@ def _first_flags(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for flag, value in (
         ("--phase", None), ("--preset", "laptop"), ("--arm", "epistemic"),
-        ("--out", "runs"), ("--name", None), ("--from", None),
+        ("--out", "runs"), ("--name", None), ("--tag", None), ("--from", None),
     ):  # fmt: skip
         parser.add_argument(flag, default=value, nargs="?")
     first, _ = parser.parse_known_args(_joined(argv))
@@ -192,22 +193,30 @@ def _first_flags(argv: Sequence[str]) -> argparse.Namespace:
     return first
 
 
-def _check_name(name: str) -> None:
+def _check_name(flag: str, name: str | None) -> None:
+    """Refuses what is no name of a folder, or names another folder of phase 2."""
+    if name is None:
+        return
     try:
         rundir.check_name(name)
     except UsageError as error:
-        raise UsageError(f"--name: {error}") from None
+        raise UsageError(f"--{flag}: {error}") from None
+    if flag == "tag" and name in get_args(TaskName):
+        raise UsageError(f"--tag {name} is not valid; it must not be a task.")
 
 
 def _check_same_run(config: Config, explored: Config) -> None:
-    """Refuses labels other than those of the run that a later phase starts from."""
-    for name in ("preset", "arm"):
-        given, valid = getattr(config, name), getattr(explored, name)
-        if given != valid:
-            raise UsageError(
-                f"--{name} {given} is not valid; it must be {valid}, as in the "
-                "exploration run."
-            )
+    """Refuses to call a model what it is not, and to learn where nothing is to."""
+    for name in _OF_THE_RUN:
+        given, found = map(operator.attrgetter(name), (config, explored))
+        flag = f"--{name.replace('_', '-')}"
+        _require(given == found, flag, given, f"{found}, as in the exploration run")
+    if explored_run(config).parent == PRETRAINED.resolve():
+        valid = "zero-shot; a model that comes with the code performs, no more"
+        _require(config.phase == "zero-shot", "--phase", config.phase, valid)
+        epochs = config.refit.num_epochs
+        valid = "0; a model that comes with the code has no data"
+        _require(epochs == 0, "--refit.num-epochs", epochs, valid)
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
@@ -231,9 +240,7 @@ def _explored(first: argparse.Namespace, default: Config) -> Config:
             "name a run with --from."
         )
     explored = from_json(rundir.read_json(path), default)
-    return dataclasses.replace(
-        explored, out=Path(first.out), name=first.name, **dict.fromkeys(_PLACE)
-    )
+    return dataclasses.replace(explored, **dict.fromkeys(_PLACE))
 
 
 def _tyro(argv: Sequence[str], default: Config) -> Config:

@@ -104,12 +104,14 @@ class Config:
     out: Path = Path("runs")
     """Folder of all runs."""
     name: str | None = None
-    """Name of the exploration run; by default PRESET-ARM. With --from, of the folder in
-    OUT for the results; by default that of the run."""
+    """Name of the exploration run; by default PRESET-ARM."""
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Exploration run for zero-shot and finetune; by default OUT/NAME."""
     at_trial: int | None = None
     """Use the explored model as it was after this trial; by default the last."""
+    tag: str | None = None
+    """Name of another attempt at phase 2, with other numbers: it has a folder of its
+    own in the run, and a row of its own in the report."""
     video: Path | None = None
     """Render a trial of each task to this mp4 (zero-shot and finetune)."""
     num_trials: int = number(60, 1, 100_000)
@@ -194,6 +196,8 @@ def validate(config: Config) -> None:
         later = "left out in explore; it is for zero-shot and finetune"
         _require(config.source is None, "--from", config.source, later)
         _require(config.at_trial is None, "--at-trial", config.at_trial, later)
+        _require(config.tag is None, "--tag", config.tag, later)
+        _require(config.task == "all", "--task", config.task, later)
     if config.video is not None:
         good = config.video.suffix == ".mp4" and config.phase in (
             "zero-shot",

@@ -23,6 +23,7 @@ class Row(NamedTuple):
     task: str  # empty while exploring
     trial: int
     explored: int  # exploration trials behind the model; 0 while exploring
+    tag: str  # of another attempt at phase 2; empty for the one that counts
     data: dict[str, Any]
     run: Path  # folder of the log
 
@@ -31,13 +32,14 @@ def load(out: Path) -> list[Row]:
     """Reads every metrics.jsonl under a folder, hidden ones left out.
 
     A last line without its end is left out too: a run is writing it, or was killed
-    while it did.
+    while it did. So is what a run did for one task where it did the same for all.
 
     Raises:
       UsageError: if there is no log, a line that is no row, or two rows for one seed,
         task and trial of an arm: averaging them would count a seed twice.
     """
-    rows = [row for log in files(out, "metrics.jsonl") for row in _read(log)]
+    logs = files(out, "metrics.jsonl")
+    rows = [row for log in logs if not _is_part(log) for row in _read(log)]
     if not rows:
         raise UsageError(f"there is no metrics.jsonl with a row under {out}.")
     seen: dict[tuple[Any, ...], Row] = {}
@@ -69,6 +71,14 @@ def label(arm: str, config: Mapping[str, Any]) -> str:
     return arm
 
 
+def _is_part(log: Path) -> bool:
+    """Tells if the folder beside this one has done all tasks, this one among them."""
+    folder = log.parent
+    task = read_json(folder / "config.json").get("task", "all")
+    whole = folder.with_name(folder.name.replace(f"-{task}", "", 1)) / log.name
+    return whole != log and whole.exists() and whole.stat().st_size > 0
+
+
 def _read(log: Path) -> Iterator[Row]:
     config = read_json(log.parent / "config.json")
     lines = log.read_text().splitlines(keepends=True)
@@ -91,6 +101,7 @@ def _row(data: dict[str, Any], config: dict[str, Any], run: Path) -> Row:
         task="" if exploring else data["task"],
         trial=int(data["trial"]),
         explored=0 if exploring else int(data["explored_trials"]),
+        tag=config.get("tag") or "",
         data=data,
         run=run,
     )

@@ -13,12 +13,12 @@ from experiments.tables import ARMS, TASKS, flat, in_order
 # Entries of a config that say what to run and where, not how.
 _NOT_SETTINGS = {
     "phase", "arm", "preset", "seeds", "task", "out", "name", "source", "at_trial",
-    "video", "milestones", "allow_cpu", "debug", "chunk_length", "eval_trials",
+    "tag", "video", "milestones", "allow_cpu", "debug", "chunk_length", "eval_trials",
     "num_trials", "finetune_trials", "num_bits",
 }  # fmt: skip
 # What a phase keeps in its config for the phases after it.
 _FOR_LATER = {
-    "explore": {"task_length", "refit", "tuning", "task_planner"},
+    "explore": {"task_length", "refit", "tuning", "task_planner", "pessimism"},
     "zero-shot": {"tuning"},
 }
 

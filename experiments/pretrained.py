@@ -16,7 +16,7 @@ from pathlib import Path
 
 import jax
 
-from experiments import checkpoint, cli, phases, rundir
+from experiments import checkpoint, cli, logs, phases, rundir
 from experiments.build import build
 from experiments.config import Config
 from experiments.errors import RunError, UsageError
@@ -67,15 +67,28 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
 
 
 def _performed(run: Path, config: Config) -> tuple[int, phases.State]:
-    """Returns the model `[S]` of the last zero-shot, and after which trial it was."""
-    folders = sorted(run.glob("zero-shot-*"))  # by the trials explored, all tasks first
-    if not folders:
+    """Returns the model `[S]` of the last zero-shot, and after which trial it was.
+
+    That of all tasks and without a tag, if there is one.
+    """
+    folders = run.glob("zero-shot-*")
+    performed = [
+        folder for folder in folders if checkpoint.steps(folder / "checkpoints")
+    ]
+    if not performed:
         raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
+    last = max(performed, key=_rank) / "checkpoints"
     template = phases.model_of(phases.explored_template(config, build(config)))
-    found = checkpoint.restore(folders[-1] / "checkpoints", template, warn=print)
-    if found is None:
-        raise UsageError(f"there is no checkpoint in {folders[-1]}.")
+    found = checkpoint.restore(last, template, warn=print)
+    assert found is not None
     return found[:2]
+
+
+def _rank(folder: Path) -> tuple[int, bool, bool, str]:
+    """Orders zero-shots: by trials explored, without a tag, of all tasks."""
+    config = logs.read_json(folder / "config.json")
+    step = checkpoint.steps(folder / "checkpoints")[-1]
+    return step, not config.get("tag"), config.get("task") == "all", folder.name
 
 
 def main(argv: Sequence[str] | None = None) -> int:

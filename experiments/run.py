@@ -56,9 +56,7 @@ def _dispatch(config: Config) -> None:
         _explore(config, source)
         return
     step = hosts.on_first(lambda: _explored_step(config, source))
-    folder = cli.results_folder(config) / f"{config.phase}-{step:03d}"
-    if config.task != "all":
-        folder = folder.with_name(f"{folder.name}-{config.task}")
+    folder = cli.results_folder(config) / _attempt(config, step)
     with _without_gl(), _opened(config, folder):
         from experiments import phases
 
@@ -66,6 +64,13 @@ def _dispatch(config: Config) -> None:
         phase(config, source, folder, step, _say)
     if config.video is not None and hosts.is_first():
         _video(config, folder)
+
+
+def _attempt(config: Config, step: int) -> str:
+    """Returns the name of the folder of a later phase: zero-shot-060-forward-TAG."""
+    task = [config.task] if config.task != "all" else []
+    tag = [config.tag] if config.tag else []
+    return "-".join([config.phase, f"{step:03d}", *task, *tag])
 
 
 def _explore(config: Config, folder: Path) -> None:

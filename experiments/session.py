@@ -9,8 +9,9 @@ from typing import Any
 from experiments import cli, rundir
 from experiments.errors import CheckpointError, InterruptedRun, RunError
 
-# Two checkpoints and one being written, of a paper-sized run of one seed.
+# Two checkpoints and one being written, of a paper-sized run of one seed and task.
 _NEEDED_BYTES = 64 * 2**20
+_NUM_TASKS = 4
 
 
 @contextlib.contextmanager
@@ -33,7 +34,10 @@ def open_run(
       CheckpointError: if the folder is in use or belongs to another config.
       StorageError: if it cannot be written to.
     """
-    rundir.probe(folder, _NEEDED_BYTES * len(config["seeds"]))
+    branches = len(config["seeds"])
+    if (config["phase"], config["task"]) == ("finetune", "all"):
+        branches *= _NUM_TASKS
+    rundir.probe(folder, _NEEDED_BYTES * branches)
     with rundir.lock(folder):
         _compare(folder / "config.json", config, ignore)
         environment = rundir.environment()
@@ -62,9 +66,10 @@ def _compare(path: Path, config: dict[str, Any], ignore: Sequence[str]) -> None:
     if path.exists():
         lines = cli.differences(rundir.read_json(path), config, ignore)
         if lines:
+            another = "--name" if config["phase"] == "explore" else "--tag"
             raise CheckpointError(
                 f"{path.parent} was started with other numbers: {'; '.join(lines)}. "
-                "Use the same flags, or another --name."
+                f"Use the same flags, or another {another}."
             )
     else:
         rundir.write_json(path, config)

@@ -112,6 +112,8 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
         ((*LATER, "--name", "../x"), ["--name", "'../x'", "at most 64"]),
         ((*SMOKE, "--video", "a.mp4"), ["--video a.mp4", "zero-shot or finetune"]),
         ((*SMOKE, "--at-trial", "2"), ["--at-trial 2", "zero-shot and finetune"]),
+        ((*SMOKE, "--tag", "x"), ["--tag x", "zero-shot and finetune"]),
+        ((*SMOKE, "--task", "forward"), ["--task forward", "zero-shot and finetune"]),
         ((*SMOKE, "--from", "there"), ["--from there", "zero-shot and finetune"]),
         (
             ("--phase", "explore", "--preset", "paper"),
@@ -180,17 +182,6 @@ def test_from_names_a_run_anywhere(out):
     assert cli.explored_run(config) == path.parent
 
 
-def test_results_have_a_folder_of_their_own_if_it_is_named(out):
-    run = explored(out, name="mine").parent
-    start = ["--phase", "zero-shot", "--from", str(run)]
-    assert cli.results_folder(cli.parse(start)) == run
-    config = cli.parse([*start, "--out", str(out / "b"), "--name", "again"])
-    assert cli.explored_run(config) == run
-    assert cli.results_folder(config) == out / "b" / "again"
-    here = cli.parse([*LATER, "--out", str(out), "--name", "mine"])
-    assert cli.explored_run(here) == cli.results_folder(here) == run
-
-
 def test_a_run_keeps_its_labels(fail, out):
     path = explored(out, name="mine", arm="count")
     start = ("--phase", "zero-shot", "--from", str(path.parent))
@@ -198,6 +189,24 @@ def test_a_run_keeps_its_labels(fail, out):
     assert code == 2 and "--arm random" in line and "count" in line
     code, line = fail(*start, "--preset", "paper")
     assert code == 2 and "--preset paper" in line and "smoke" in line
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--seeds", "6"), "--seeds (6,) is not valid; it must be (3, 5)"),
+        (("--seeds", "5", "3"), "--seeds (5, 3) is not valid"),
+        (("--num-bits", "16"), "--num-bits 16 is not valid; it must be 32"),
+        (("--num-trials", "4"), "--num-trials 4 is not valid; it must be 3"),
+        (("--model.hidden-size", "8"), "--model.hidden-size 8 is not valid"),
+        (("--tag", "forward"), "--tag forward is not valid; it must not be a task"),
+        (("--tag", "../x"), "--tag: run '../x' is not a valid name"),
+    ],
+)
+def test_a_model_is_called_what_it_is(fail, out, flags, words):
+    explored(out, seeds=(3, 5))
+    code, line = fail(*LATER, *flags)
+    assert code == 2 and words in line
 
 
 @pytest.mark.parametrize(

@@ -81,9 +81,31 @@ def test_a_shipped_model_acts_as_its_run(explored, shelf, tmp_path, capsys):
 
 def test_only_the_model_is_there(explored, shelf, tmp_path, capsys):
     pretrained.main([str(explored), "mine"])
-    command = ["--phase", "finetune", "--from", "pretrained/mine", *SMALL]
-    assert main([*command, "--out", str(tmp_path)]) == 3
-    assert "it lacks " in capsys.readouterr().err.splitlines()[-1]
+    for flags, words in (
+        (
+            ["--phase", "finetune"],
+            "--phase finetune is not valid; it must be zero-shot",
+        ),
+        (["--phase", "zero-shot", *runs.REFIT], "--refit.num-epochs 1 is not valid"),
+    ):
+        command = [*flags, "--from", "pretrained/mine", *SMALL]
+        assert main([*command, "--out", str(tmp_path)]) == 2
+        assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_another_attempt_is_not_what_is_shipped(explored, shelf, tmp_path):
+    run = tmp_path / runs.NAME
+    shutil.copytree(explored, run)
+    pretrained.ship(run, "before")
+    again = ["--phase", "zero-shot", "--from", str(run), *SMALL, "--tag", "xs"]
+    assert main(again) == 0  # without a refit
+    pretrained.ship(run, "after")
+    sums = [
+        (shelf / name / "checkpoints/3/meta/metadata").read_text()
+        for name in ("before", "after")
+    ]
+    assert sums[0] == sums[1]
 
 
 def test_a_name_is_taken_once(explored, shelf, capsys):
