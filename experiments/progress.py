@@ -4,7 +4,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 import tqdm
@@ -12,11 +12,39 @@ import tqdm
 from experiments import hosts
 from experiments.errors import InterruptedRun
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # A log file gets a line per trial, no bar.
 _BAR = (
     "{desc} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} steps "
     "[{elapsed} < {remaining}, {rate_fmt}]"
 )
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[None]:
+    """Turns the first SIGINT or SIGTERM into InterruptedRun, wherever the program is.
+
+    `Progress.interruptible`, inside, waits for the next tick instead.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del frame
+        for name in _SIGNALS:
+            signal.signal(name, signal.SIG_DFL)
+        raise InterruptedRun(signal.Signals(number).name)
+
+    with _handled_by(stop):
+        yield
+
+
+@contextlib.contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    before = [signal.signal(name, handler) for name in _SIGNALS]
+    try:
+        yield
+    finally:
+        for name, old in zip(_SIGNALS, before, strict=True):
+            signal.signal(name, old)
 
 
 class Progress:
@@ -72,14 +100,11 @@ class Progress:
         def request(number: int, frame: FrameType | None) -> None:
             del frame
             self._stop = number
-            for name in (signal.SIGINT, signal.SIGTERM):
+            for name in _SIGNALS:
                 signal.signal(name, signal.SIG_DFL)
 
-        names = (signal.SIGINT, signal.SIGTERM)
-        before = [signal.signal(name, request) for name in names]
         try:
-            yield
+            with _handled_by(request):
+                yield
         finally:
-            for name, handler in zip(names, before, strict=True):
-                signal.signal(name, handler)
             self._bar.close()

@@ -18,6 +18,7 @@ from experiments.errors import (
     UsageError,
 )
 from experiments.presets import PRESETS
+from experiments.progress import stoppable
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,7 +58,7 @@ def _dispatch(config: Config) -> None:
         return
     step = hosts.on_first(lambda: _explored_step(config, source))
     folder = cli.results_folder(config) / _attempt(config, step)
-    with _without_gl(), _opened(config, folder):
+    with _without_gl(), stoppable(), _opened(config, folder):
         from experiments import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
@@ -75,7 +76,7 @@ def _attempt(config: Config, step: int) -> str:
 
 def _explore(config: Config, folder: Path) -> None:
     _check_cpu(config)
-    with _without_gl(), _opened(config, folder):
+    with _without_gl(), stoppable(), _opened(config, folder):
         from experiments import phases
 
         phases.explore(config, folder, _say)
