@@ -60,7 +60,8 @@ def explore(config: Config, folder: Path, say: Say) -> None:
         )
 
     def labels(trial: int) -> list[dict[str, Any]]:
-        planner = "random" if trial <= config.random_trials else "plan"
+        random = trial <= config.random_trials or config.arm == "random"
+        planner = "random" if random else "plan"
         common = {"phase": "explore", "arm": config.arm, "planner": planner}
         steps = trial * config.trial_length
         return [

@@ -94,6 +94,7 @@ def _write(
     rows: Sequence[Row], counts: Mapping[str, Counts], out: Path, files: _Files
 ) -> None:
     """Writes the files of one preset."""
+    every, rows = rows, [row for row in rows if not row.tag] or rows
     explored = _explored(rows)
     found = scores(rows, explored)
     _write_json(files.table_1, found)
@@ -111,6 +112,7 @@ def _write(
         *(f"- {note}" for note in notes(rows, found, explored)),
         "",
         *_zero_shot(rows, found, explored),
+        *_attempts(every),
         *_fine_tuning(rows, explored),
         "## Figure 4",
         "",
@@ -127,7 +129,7 @@ def _write(
         *data_sections.covered(counts, files.coverage),
         *data_sections.model_error(out / "model_error.json", rows[0].preset),
         *_ablation(out / "ablation.jsonl"),
-        *_runs(rows, out),
+        *_runs(every, out),
     ]
     files.report.write_text("\n".join(lines))
 
@@ -217,9 +219,31 @@ def _zero_shot(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
     return lines
 
 
+def _attempts(rows: Sequence[Row]) -> list[str]:
+    """Returns the section on zero-shots with other numbers, each under its tag."""
+    tagged = [row for row in rows if row.phase == "zero-shot" and row.tag]
+    if not tagged:
+        return []
+    lines = []
+    for tag, arm, explored in sorted({(r.tag, r.arm, r.explored) for r in tagged}):
+        own = [row for row in tagged if (row.tag, row.arm) == (tag, arm)]
+        by_task = scores(own, explored)[arm]
+        cells = [tables.cell(by_task.get(task, {}), full=True) for task in TASKS]
+        lines.append([tag, arm, str(explored), *cells])
+    text = "Zero-shot with other numbers (`--tag`), which the sections above leave out."
+    header = ["attempt", "arm", "explored trials", *TASKS]
+    return ["## Other attempts", "", text, "", *tables.table(header, lines)]
+
+
 def _random_actions(rows: Sequence[Row]) -> list[str]:
     """Returns what a trial of random actions returns, for scale."""
-    random = [row for row in rows if row.data.get("planner") == "random"]
+    # The random trials at the start are the same in all arms of a seed.
+    random = {
+        (row.seed, row.trial): row
+        for row in rows
+        if row.data.get("planner") == "random"
+        or (row.phase, row.arm) == ("explore", "random")
+    }.values()
     means = []
     for task in TASKS:
         values = np.array([number(row.data["returns"][task]) for row in random])

@@ -114,8 +114,41 @@ def test_report_shows_means_spread_and_every_seed(out):
     assert "| 5 | 2000 ± 0.7 (2 seeds) |" in text
     assert "| laptop-epistemic | 3 | 3 | 4.00 | 1.00 | 5.00 |" in text
     assert "jax 9.9, device_kind abacus" in text
-    # Trial 1 of 6 seeds, -(1 + seed).
-    assert "mean of 6 trials: forward -2.0" in text
+    # Trial 1 of 3 seeds, the same in both arms: -(1 + seed).
+    assert "mean of 3 trials: forward -2.0" in text
+
+
+def test_all_trials_of_the_random_arm_are_random(tmp_path):
+    write_arm(tmp_path / "runs", "random", [1.0])
+    text, _ = report_of(tmp_path / "runs")
+    assert "mean of 3 trials: forward -2.0" in text  # -(trial + seed)
+
+
+def test_another_attempt_is_a_row_of_its_own(out):
+    scores = {"epistemic": [40.0, 50.0, 90.0]}
+    rows = zero_shot_rows("epistemic", scores["epistemic"])
+    before, table = report_of(out)
+    folder = out / "laptop-epistemic" / "zero-shot-003-short"
+    config = {"phase": "zero-shot", "arm": "epistemic", "tag": "short"}
+    write_run(folder, rows, **config, task_planner={"horizon": 2})
+    text, again = report_of(out)
+    assert again == table and "Other attempts" not in before
+    assert "| short | epistemic | 3 | 60 ± 26<br>[" in text
+    assert "Unequal settings" not in text
+
+
+def test_a_task_alone_does_not_count_beside_all(out):
+    run = out / "laptop-epistemic"
+    rows = [
+        row for row in zero_shot_rows("epistemic", [1.0]) if row["task"] == "forward"
+    ]
+    config = {"phase": "zero-shot", "arm": "epistemic"}
+    write_run(run / "zero-shot-003-forward", rows, task="forward", **config)
+    _, table = report_of(out)
+    assert table["epistemic"]["forward"]["seeds"] == [400.0, 500.0, 900.0]
+    (run / "zero-shot-003" / "metrics.jsonl").unlink()
+    _, table = report_of(out)
+    assert table["epistemic"]["forward"]["seeds"] == [1.0]
 
 
 def test_report_says_what_is_missing(out):
