@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks import env, fit, plan, rollout, rows
+from benchmarks import env, fit, plan, rollout, rows, trace
 
 SET = (
     (plan, "--precision bf16 tf32 --seeds 1 4 16"),
@@ -16,6 +16,7 @@ SET = (
     (plan, "--engine scan kernel --seeds 1 4 16"),
     (plan, "--engine scan kernel --seeds 1 4 16 --plans 10"),
     (plan, "--engine kernel --seeds 1 --num-samples 125 250 1000 2000 4000 8000"),
+    (trace, "--seeds 1 4"),
 )
 
 

@@ -18,11 +18,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 import jaxpets
 from benchmarks import rows, timing, workloads
-from jaxpets.envs import half_cheetah
 
 COLUMNS = (
     "engine", "precision", "seeds", "plans", "num_samples", "horizon", "compile_s",
@@ -50,16 +48,8 @@ def measure(
     planner = workloads.planner(
         size, precision, args.optimizer, args.reward, args.chunk_size, engine
     )
-    keys = jax.random.split(jax.random.key(0), seeds)
-
-    @jax.jit
-    @jax.vmap
-    def prepare(key: jax.Array) -> tuple[jaxpets.PlanParams, Any, jax.Array]:
-        obs = 0.1 * jax.random.normal(key, (half_cheetah.OBS_SIZE,), jnp.float32)
-        return workloads.plan_params(size, key, args.reward), planner.init(), obs
-
-    params, state, obs = prepare(keys)
-    inputs = (params, keys, state, obs)
+    prepare = jax.jit(jax.vmap(workloads.plan_inputs(size, planner, args.reward)))
+    inputs = prepare(jax.random.split(jax.random.key(0), seeds))
     program = in_turn(planner, args.plans) if args.plans > 1 else planner.step
     step, compile_s = timing.compile_program(jax.vmap(program), *inputs)
     call = functools.partial(step, *inputs)

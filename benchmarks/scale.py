@@ -15,13 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from benchmarks import plan, rows, timing, workloads
-from jaxpets.envs import half_cheetah
 
 COLUMNS = (
     "benchmark", "engine", "devices", "num_samples", "compile_s", "one_ms", "all_ms",
@@ -46,7 +44,7 @@ def seeds(size: workloads.Size, count: int, args: argparse.Namespace) -> dict[st
     """Compares `count` seeds on as many devices with one seed on one."""
     planner = workloads.planner(size, args.precision, engine=args.engine)
     mesh = _mesh(count)
-    inputs = jax.jit(jax.vmap(_prepared(size, planner)))(
+    inputs = jax.jit(jax.vmap(workloads.plan_inputs(size, planner)))(
         jax.random.split(jax.random.key(0), count)
     )
     each = [jax.tree.map(lambda x, i=i: x[i : i + 1], inputs) for i in range(count)]
@@ -74,7 +72,7 @@ def candidates(
     parted = jaxpets.plan(
         rollout, jaxpets.rewards.epistemic, jaxpets.sharded(search, AXIS)
     )
-    inputs = jax.jit(_prepared(size, whole))(jax.random.key(0))
+    inputs = jax.jit(workloads.plan_inputs(size, whole))(jax.random.key(0))
     one, _ = timing.compile_program(plan.in_turn(whole, args.plans), *inputs)
     mesh = _mesh(count)
     placed = jax.device_put(inputs, NamedSharding(mesh, P()))
@@ -128,20 +126,6 @@ def _over(
     return jax.shard_map(
         function, mesh=mesh, in_specs=takes, out_specs=gives, check_vma=False
     )
-
-
-def _prepared(
-    size: workloads.Size, planner: jaxpets.Planner
-) -> Callable[[Array], tuple[Any, ...]]:
-    """Returns a function from a key to what a plan is called with."""
-
-    def prepare(key: Array) -> tuple[Any, ...]:
-        model_key, obs_key, key = jax.random.split(key, 3)
-        obs = 0.1 * jax.random.normal(obs_key, (half_cheetah.OBS_SIZE,), jnp.float32)
-        params = workloads.plan_params(size, model_key, "epistemic")
-        return params, key, planner.init(), obs
-
-    return prepare
 
 
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:

@@ -260,6 +260,19 @@ def plan_params(size: Size, key: Array, reward: str) -> jaxpets.PlanParams:
     return jaxpets.PlanParams(dynamics, jaxpets.max_variance(dynamics))
 
 
+def plan_inputs(
+    size: Size, planner: jaxpets.Planner, reward: str = "epistemic"
+) -> Callable[[Array], tuple[jaxpets.PlanParams, Array, Any, Array]]:
+    """Returns a function from a key to what `planner.step` is called with."""
+
+    def prepare(key: Array) -> tuple[jaxpets.PlanParams, Array, Any, Array]:
+        model_key, obs_key, key = jax.random.split(key, 3)
+        obs = 0.1 * jax.random.normal(obs_key, (half_cheetah.OBS_SIZE,), jnp.float32)
+        return plan_params(size, model_key, reward), key, planner.init(), obs
+
+    return prepare
+
+
 def candidates_per_action(size: Size, search: str) -> int:
     """Returns how many action sequences are rolled out for one action."""
     if search == "cem":

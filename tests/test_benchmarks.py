@@ -18,6 +18,7 @@ from benchmarks import (
     real_data,
     rollout,
     timing,
+    trace,
     trial,
     workloads,
 )
@@ -254,3 +255,40 @@ def test_bad_usage(capsys):
             program.main(flags.split())
         assert caught.value.code == 2
         assert message in capsys.readouterr().err
+
+
+def test_a_trace_is_summed_over_the_streams_of_the_gpu():
+    def event(name, dur, pid=1, tid=7):
+        return {"ph": "X", "name": name, "dur": dur, "pid": pid, "tid": tid, "ts": 0}
+
+    def label(kind, name, pid, **more):
+        return {"ph": "M", "name": kind, "pid": pid, "args": {"name": name}, **more}
+
+    events = [
+        label("process_name", "/device:GPU:0", 1),
+        label("process_name", "/host:CPU", 2),
+        label("thread_name", "Stream #7(Compute)", 1, tid=7),
+        label("thread_name", "XLA Modules", 1, tid=8),
+        label("thread_name", "Stream of thought", 2, tid=7),
+        event("rollout_kernel", 20.0),
+        event("sort", 1.0),
+        event("rollout_kernel", 22.0),
+        event("jit_run", 60.0, tid=8),
+        event("python", 90.0, pid=2),
+        {"ph": "X", "dur": 1.0},
+    ]
+    found = trace.programs_of({"traceEvents": events})
+    assert found == {"rollout_kernel": (42.0, 2), "sort": (1.0, 1)}
+    programs = {name: (10 * us, n) for name, (us, n) in found.items()}
+    row = trace._row(
+        workloads.named_size("tiny"), 4, timing.Timing(1, 2, 2, 3), programs
+    )
+    assert row["rollout_us"] == 42.0 and row["busy_us"] == 43.0
+    assert row["outside"] == pytest.approx(1 / 43)
+    assert row["idle"] == pytest.approx(1 - 43 / 200)
+    assert row["ms_per_plan"] == pytest.approx(0.05)
+
+
+def test_where_no_kernel_runs_nothing_is_traced():
+    with pytest.raises(SystemExit, match="no kernel to time"):
+        trace.main(["--tiny", "--seeds", "1"])
