@@ -1,4 +1,4 @@
-"""The set that is run on a GPU: plan, fit, rollout and env, in a few minutes."""
+"""The set that is run on a GPU: plan, fit, rollout, env and trace, in a few minutes."""
 
 import time
 from collections.abc import Sequence
