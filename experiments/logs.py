@@ -75,6 +75,8 @@ def _is_part(log: Path) -> bool:
     """Tells if the folder beside this one has done all tasks, this one among them."""
     folder = log.parent
     task = read_json(folder / "config.json").get("task", "all")
+    if task == "all":
+        return False
     whole = folder.with_name(folder.name.replace(f"-{task}", "", 1)) / log.name
     return whole != log and whole.exists() and whole.stat().st_size > 0
 

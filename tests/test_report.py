@@ -151,6 +151,12 @@ def test_a_task_alone_does_not_count_beside_all(out):
     assert table["epistemic"]["forward"]["seeds"] == [1.0]
 
 
+def test_a_run_that_is_called_all_counts(out):
+    rows = [{**row, "seed": 7} for row in explore_rows("epistemic", [0])]
+    write_run(out / "laptop-epistemic-all", rows, phase="explore", task="all")
+    assert {row.seed for row in load(out) if row.arm == "epistemic"} == {0, 1, 2, 7}
+
+
 def test_report_says_what_is_missing(out):
     text, _ = report_of(out)
     assert "no log of random, oracle." in text
