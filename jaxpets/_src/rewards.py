@@ -1,13 +1,12 @@
 """Rewards that seek, or shun, what the ensemble does not know."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array
+from jaxpets._src.checks import check_array, check_real
 from jaxpets._src.types import RewardFn
 
 
@@ -110,10 +109,9 @@ def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
       ValueError if the shapes do not fit, or there is only one member.
 
     Raises:
-      ValueError: if caution is negative or not finite.
+      TypeError, ValueError: unless caution is a finite number of at least 0.
     """
-    if not 0 <= caution < math.inf:
-        raise ValueError(f"caution must be finite and at least 0, got {caution}.")
+    check_real("caution", caution, 0.0)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         check_array("next_obs", next_obs, ["E", "P", "D"])
