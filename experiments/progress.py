@@ -27,18 +27,23 @@ def stoppable() -> Iterator[None]:
     `Progress.interruptible`, inside, waits for the next tick instead.
     """
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        del frame
-        for name in _SIGNALS:
-            signal.signal(name, signal.SIG_DFL)
+    def stop(number: int) -> None:
         raise InterruptedRun(signal.Signals(number).name)
 
-    with _handled_by(stop):
+    with _first_signal(stop):
         yield
 
 
 @contextlib.contextmanager
-def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+def _first_signal(act: Callable[[int], None]) -> Iterator[None]:
+    """Calls `act` with the first SIGINT or SIGTERM; a second ends the process."""
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        del frame
+        for name in _SIGNALS:
+            signal.signal(name, signal.SIG_DFL)
+        act(number)
+
     before = [signal.signal(name, handler) for name in _SIGNALS]
     try:
         yield
@@ -97,14 +102,11 @@ class Progress:
         A second signal ends the process at once, as if nothing were caught.
         """
 
-        def request(number: int, frame: FrameType | None) -> None:
-            del frame
+        def request(number: int) -> None:
             self._stop = number
-            for name in _SIGNALS:
-                signal.signal(name, signal.SIG_DFL)
 
         try:
-            with _handled_by(request):
+            with _first_signal(request):
                 yield
         finally:
             self._bar.close()
