@@ -6,6 +6,7 @@ is limited by the model.
 """
 
 import dataclasses
+import datetime
 import sys
 import time
 from collections.abc import Sequence
@@ -72,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Performs, and prints a line per task."""
     args = tyro.cli(Arguments, args=argv, prog="experiments.simulator")
     begin = time.monotonic()
+    date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    where = {"date": date, "env": rundir.environment()}
     returns = perform(args)
     for name, own in zip(half_cheetah.TASK_NAMES, returns, strict=True):
         each = " ".join(f"{value:.0f}" for value in own)
@@ -85,6 +88,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 "steps": args.trial_length,
                 "engine": args.engine,
                 "task_planner": dataclasses.asdict(args.task_planner),
+                **where,
             }
             for i, value in enumerate(own.tolist())
         ]

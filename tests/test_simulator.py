@@ -32,3 +32,4 @@ def test_every_task_is_performed_and_logged(tmp_path, capsys):
     assert (returns.mean(1) > 0).all()
     assert (returns[:, 0] != returns[:, 1]).all()
     assert rows[0]["task_planner"]["horizon"] == 10
+    assert all(row["date"] and row["env"]["device_kind"] == "cpu" for row in rows)
