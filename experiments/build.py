@@ -123,7 +123,9 @@ def trial_keys(config: Config, phase: int, trial: int) -> Array:
 
 
 def _fitter(ensemble: jaxpets.Ensemble, numbers: TrainingNumbers) -> jaxpets.Fitter:
-    size = jaxpets.FitConfig(numbers.num_epochs, numbers.batch_size, numbers.final_rate)
+    size = jaxpets.FitConfig(
+        numbers.num_epochs, numbers.batch_size, numbers.final_rate, numbers.bootstrap
+    )
     return jaxpets.fit(ensemble, optax.adam(numbers.learning_rate), size)
 
 

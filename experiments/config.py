@@ -48,6 +48,8 @@ class TrainingNumbers:
     """Of Adam."""
     final_rate: float = number(1.0, 0.0, 1.0)
     """Share of the learning rate that is left at the end of a fit."""
+    bootstrap: bool = True
+    """Every member sees its own draw of the rows; otherwise all of them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -51,15 +51,19 @@ def shown_rows(model, params):
         jax.debug.callback(report, targets, weight, ordered=True)
         return model.loss(network, inputs, targets, weight)
 
-    config = FitConfig(num_epochs=2, batch_size=8)
-    fitter = jaxpets.fit(model._replace(loss=loss), optax.sgd(0.0), config)
-    step = jax.jit(fitter.step)
+    def build(bootstrap):
+        config = FitConfig(num_epochs=2, batch_size=8, bootstrap=bootstrap)
+        fitter = jaxpets.fit(model._replace(loss=loss), optax.sgd(0.0), config)
+        return fitter.init(params), jax.jit(fitter.step)
 
-    def run(size, seed=0):
+    built = {bootstrap: build(bootstrap) for bootstrap in (True, False)}
+
+    def run(size, seed=0, bootstrap=True):
+        state, step = built[bootstrap]
         number = jnp.arange(size, dtype=jnp.float32)[:, None] + jnp.zeros((1, 2))
         data = jaxpets.Transition(0 * number, jnp.zeros((size, 1)), number)
         seen.clear()
-        step(params, jax.random.key(seed), fitter.init(params), dataset_of(data))
+        step(params, jax.random.key(seed), state, dataset_of(data))
         jax.effects_barrier()
         full = [batch for batch in seen if batch[1].any()]  # some have no rows
         return tuple(
@@ -87,6 +91,18 @@ def test_an_epoch_shows_each_member_its_bootstrap_once(shown_rows, size):
         bootstraps.append(sorted(epoch_rows[0]))
     if size > 8:
         assert bootstraps[0] != bootstraps[1] != bootstraps[2]
+
+
+@pytest.mark.parametrize("size", [1, 19, 40])
+def test_without_a_bootstrap_every_member_sees_every_row_in_an_order_of_its_own(
+    shown_rows, size
+):
+    rows, weights = shown_rows(size, bootstrap=False)
+    used = weights > 0
+    orders = {tuple(rows[i, :, e][used[i]]) for i in range(2) for e in range(3)}
+    assert all(sorted(order) == list(range(size)) for order in orders)
+    if size > 8:
+        assert len(orders) == 6
 
 
 def test_the_last_batch_is_weighted_by_what_is_left(shown_rows):

@@ -105,6 +105,8 @@ def test_bad_settings_fail_when_built():
         FitConfig(num_epochs=0)
     with pytest.raises(TypeError, match="batch_size must be a Python int"):
         FitConfig(batch_size=32.0)
+    with pytest.raises(TypeError, match="bootstrap must be True or False, got 1"):
+        FitConfig(bootstrap=1)
     with pytest.raises(dataclasses.FrozenInstanceError):
         FitConfig().batch_size = 1
 

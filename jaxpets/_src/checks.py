@@ -31,6 +31,12 @@ def check_counts(name: str, values: Any) -> None:
         check_count(name, value)
 
 
+def check_flag(name: str, value: Any) -> None:
+    """Raises unless `value` is True or False; a traced one cannot choose a program."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name} must be True or False, got {value!r}.")
+
+
 def check_real(name: str, value: Any, low: float, high: float = math.inf) -> None:
     """Raises unless `value` is a finite Python number in `[low, high]`."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxpets._src.checks import check_count, check_key, check_real
+from jaxpets._src.checks import check_count, check_flag, check_key, check_real
 from jaxpets._src.ensemble import Ensemble, EnsembleParams, NetworkParams
 from jaxpets._src.types import Dataset
 
@@ -28,16 +28,21 @@ class FitConfig:
         falls along a cosine and starts anew with every call (SGDR, Loshchilov and
         Hutter, 2017). 1 is PETS's constant rate, whose last steps leave noise in the
         weights that looks like disagreement.
+      bootstrap: whether a member sees its own draw of rows, which leaves out a third
+        of them, or every row, and differs by its first weights and order alone (deep
+        ensembles, Lakshminarayanan et al., 2017).
     """
 
     num_epochs: int = 5
     batch_size: int = 32
     final_rate: float = 1.0
+    bootstrap: bool = True
 
     def __post_init__(self) -> None:
         check_count("num_epochs", self.num_epochs)
         check_count("batch_size", self.batch_size)
         check_real("final_rate", self.final_rate, 0.0, 1.0)
+        check_flag("bootstrap", self.bootstrap)
 
 
 class FitState(NamedTuple):
@@ -75,10 +80,11 @@ def fit(
     """Builds the trainer of PETS.
 
     One call refits the scaler on all data, draws a bootstrap per member (as many rows
-    as there are, with replacement; section 3.2), and runs `num_epochs` epochs over it,
-    shuffled anew for each member and epoch. Networks and optimizer go on from where
-    the last call left them. The number of updates follows the data, so a growing
-    dataset needs no retrace; the last batch of an epoch is masked to what is left.
+    as there are, with replacement; section 3.2) unless `config` says otherwise, and
+    runs `num_epochs` epochs over it, shuffled anew for each member and epoch. Networks
+    and optimizer go on from where the last call left them. The number of updates
+    follows the data, so a growing dataset needs no retrace; the last batch of an epoch
+    is masked to what is left.
 
     To train several seeds at once, map `step` over `(0, 0, 0, jaxpets.DATASET_AXES)`.
 
@@ -88,7 +94,7 @@ def fit(
     Args:
       ensemble: what to train.
       optimizer: for example `optax.adam(1e-3)`.
-      config: epochs and batch size.
+      config: how often and in what portions the data are shown.
 
     Returns:
       A Fitter.
@@ -134,7 +140,10 @@ def fit(
         num_members = jax.tree.leaves(params.network.members)[0].shape[0]
         shape = (num_members, inputs.shape[0])
         bootstrap_key, epochs_key = jax.random.split(key)
-        bootstrap = jax.random.randint(bootstrap_key, shape, 0, jnp.maximum(size, 1))
+        if config.bootstrap:
+            shown = jax.random.randint(bootstrap_key, shape, 0, jnp.maximum(size, 1))
+        else:
+            shown = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32), shape)
         num_batches = (size + batch_size - 1) // batch_size
 
         def epoch(carry: tuple, inputs_: tuple) -> tuple[tuple, None]:
@@ -142,7 +151,7 @@ def fit(
             number, key = inputs_
             order = jax.random.uniform(key, shape, jnp.float32)
             order = jnp.where(jnp.arange(shape[1]) < size, order, jnp.inf)
-            rows = jnp.take_along_axis(bootstrap, jnp.argsort(order, axis=1), axis=1)
+            rows = jnp.take_along_axis(shown, jnp.argsort(order, axis=1), axis=1)
 
             def batch(i: Array, carry: tuple) -> tuple:
                 network, opt_state, skipped, totals = carry
