@@ -75,9 +75,9 @@ PRESETS = {
 
 # What models that come with the code perform with: the laptop's search, further ahead.
 PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
-# How `best` performs: a longer refit, and a search from fewer elites in noise that
-# keeps its direction for a while.
-_BEST_REFIT = TrainingNumbers(800, 256, final_rate=0.005)
+# How `best` performs: a longer refit, of every member on every row, and a search from
+# fewer elites in noise that keeps its direction for a while.
+_BEST_REFIT = TrainingNumbers(800, 256, final_rate=0.005, bootstrap=False)
 _BEST_SEARCH = PlannerNumbers(optimizer="icem", num_elites=25, noise_beta=0.5)
 
 
