@@ -226,12 +226,13 @@ def _attempts(rows: Sequence[Row]) -> list[str]:
         return []
     lines = []
     for tag, arm, explored in sorted({(r.tag, r.arm, r.explored) for r in tagged}):
-        own = [row for row in tagged if (row.tag, row.arm) == (tag, arm)]
+        own = [r for r in tagged if (r.tag, r.arm, r.explored) == (tag, arm, explored)]
         by_task = scores(own, explored)[arm]
         cells = [tables.cell(by_task.get(task, {}), full=True) for task in TASKS]
-        lines.append([tag, arm, str(explored), *cells])
+        seeds = " ".join(map(str, sorted({row.seed for row in own})))
+        lines.append([tag, arm, str(explored), seeds, *cells])
     text = "Zero-shot with other numbers (`--tag`), which the sections above leave out."
-    header = ["attempt", "arm", "explored trials", *TASKS]
+    header = ["attempt", "arm", "explored trials", "seeds", *TASKS]
     return ["## Other attempts", "", text, "", *tables.table(header, lines)]
 
 

@@ -133,7 +133,7 @@ def test_another_attempt_is_a_row_of_its_own(out):
     write_run(folder, rows, **config, task_planner={"horizon": 2})
     text, again = report_of(out)
     assert again == table and "Other attempts" not in before
-    assert "| short | epistemic | 3 | 60 ± 26<br>[" in text
+    assert "| short | epistemic | 3 | 0 1 2 | 60 ± 26<br>[" in text
     assert "Unequal settings" not in text
 
 
