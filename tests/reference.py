@@ -108,7 +108,7 @@ def negative_log_likelihood(mean, logvar, target):
 def pets_loss(
     kernels, biases, min_logvar, max_logvar, scaler, inputs, targets, *, decays
 ):
-    """Loss of the whole ensemble on its bootstrapped batch.
+    """Loss of the whole ensemble on its bootstrapped batch, and its share of errors.
 
     Args:
       kernels, biases: per layer, `[E, in, out]` and `[E, out]`.
@@ -127,10 +127,11 @@ def pets_loss(
         )
         logvar = bound_logvar(raw, np.float64(min_logvar), np.float64(max_logvar))
         total += negative_log_likelihood(mean, logvar, np.float64(targets[e]))
+    nll = total
     for decay, kernel in zip(decays, kernels, strict=True):
         total += decay * float((np.float64(kernel) ** 2).sum()) / 2.0
     total += 0.01 * float(np.float64(max_logvar).sum())
-    return total - 0.01 * float(np.float64(min_logvar).sum())
+    return total - 0.01 * float(np.float64(min_logvar).sum()), nll
 
 
 def cheetah_inputs(obs, action):

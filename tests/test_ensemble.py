@@ -73,10 +73,10 @@ def test_loss_equals_the_reference(model, params):
     targets = rng.normal(size=(E, B, D)).astype(np.float32)
     weight = jnp.full((B,), 1.0 / B, jnp.float32)
     network = params.network
-    got, mse = jax.jit(model.loss)(network, inputs, targets, weight)
+    got, (nll, mse) = jax.jit(model.loss)(network, inputs, targets, weight)
     kernels, biases = layers(network)
     identity = (np.zeros(D + A), np.ones(D + A))
-    want = reference.pets_loss(
+    want, want_nll = reference.pets_loss(
         kernels,
         biases,
         network.min_logvar,
@@ -87,6 +87,7 @@ def test_loss_equals_the_reference(model, params):
         decays=(1e-4, 2e-4, 3e-4),
     )
     np.testing.assert_allclose(got, want, rtol=1e-5)
+    np.testing.assert_allclose(nll, want_nll, rtol=1e-5)
     square = [
         (reference.forward([k[e] for k in kernels], [b[e] for b in biases], x)[0] - y)
         ** 2

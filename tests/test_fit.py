@@ -155,7 +155,7 @@ def test_partial_batch_equals_the_reference_on_its_rows(model, params):
     raw = np.concatenate([data.obs, data.action], axis=-1)
     mean, std = reference.input_scaler(np.float64(raw))
     layers = [params.network.members["params"][f"layer_{i}"] for i in range(3)]
-    want = reference.pets_loss(
+    _, want = reference.pets_loss(
         [layer["kernel"] for layer in layers],
         [layer["bias"] for layer in layers],
         params.network.min_logvar,
@@ -189,7 +189,7 @@ def test_counts_its_updates(step, fitter, params, size):
 def test_the_rate_falls_along_a_cosine_in_every_call(model, params, final):
     """A loss of slope 1 and steps of size 1 add up the rates of all updates."""
     sloped = model._replace(
-        loss=lambda network, *_: (jnp.sum(network.min_logvar), jnp.zeros(()))
+        loss=lambda network, *_: (jnp.sum(network.min_logvar), (jnp.zeros(()),) * 2)
     )
     config = FitConfig(num_epochs=3, batch_size=8, final_rate=final)
     fitter = jaxpets.fit(sloped, optax.sgd(1.0), config)

@@ -67,10 +67,10 @@ def test_an_update_whose_gradient_is_not_finite_is_dropped(model, params):
     """A loss may be finite where its gradient is not."""
 
     def loss(network, inputs, targets, weight):
-        total, mse = model.loss(network, inputs, targets, weight)
+        total, errors = model.loss(network, inputs, targets, weight)
         zero = jnp.sum(weight) - jnp.sum(weight)
         # The root has the value 0 and an infinite slope.
-        return total + jnp.sqrt(zero * jnp.sum(network.max_logvar)), mse
+        return total + jnp.sqrt(zero * jnp.sum(network.max_logvar)), errors
 
     fitter = jaxpets.fit(model._replace(loss=loss), optax.adam(1e-3), FitConfig())
     dataset = dataset_of(toys.transitions(40))

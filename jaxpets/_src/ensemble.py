@@ -88,8 +88,8 @@ class Ensemble(NamedTuple):
     sample: a DynamicsFn; draws from `predict` and bounds the result.
     fit_scaler: `(data: Transition [C, ...], size []) -> Scaler` over the first rows.
     encode: `(scaler, data: Transition) -> (inputs [..., F+A], targets [..., D])`.
-    loss: `(network, inputs [E, B, F+A], targets [E, B, D], weight [B]) -> (loss, mse)`;
-      `weight` sums to one.
+    loss: `(network, inputs [E, B, F+A], targets [E, B, D], weight [B]) -> (loss, (nll,
+      mse))`; `weight` sums to one, `nll` is the loss without its penalties.
     project: `(network) -> network` with variance bounds in order.
     """
 
@@ -98,7 +98,9 @@ class Ensemble(NamedTuple):
     sample: DynamicsFn
     fit_scaler: Callable[[Transition, Array], Scaler]
     encode: Callable[[Scaler, Transition], tuple[Array, Array]]
-    loss: Callable[[NetworkParams, Array, Array, Array], tuple[Array, Array]]
+    loss: Callable[
+        [NetworkParams, Array, Array, Array], tuple[Array, tuple[Array, Array]]
+    ]
     project: Callable[[NetworkParams], NetworkParams]
 
 
@@ -149,7 +151,7 @@ def ensemble(
     variance is `exp(lv) = exp(min) + exp(max) * sigmoid(raw - max)`.
 
     The loss is that of PETS: the sum over members of the mean over rows and
-    dimensions of `(mean - y)^2 exp(-lv) + lv`, plus weight decay, plus
+    dimensions of `(mean - y)^2 exp(-lv) + lv`, and two penalties: weight decay, and
     `bound_decay * (sum(max_logvar) - sum(min_logvar))`.
 
     Args:
@@ -234,7 +236,7 @@ def ensemble(
 
     def loss(
         network: NetworkParams, inputs: Array, targets: Array, weight: Array
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, tuple[Array, Array]]:
         mean, raw = forward(network, inputs)
         low, high = network.min_logvar, network.max_logvar
         logvar = high - jax.nn.softplus(high - raw)
@@ -246,9 +248,9 @@ def ensemble(
             for i, rate in enumerate(config.weight_decays)
         )
         gap = jnp.sum(network.max_logvar) - jnp.sum(network.min_logvar)
-        total = jnp.sum(rows * weight) + decay + config.bound_decay * gap
+        nll = jnp.sum(rows * weight)
         mse = jnp.sum(jnp.mean(square, axis=(0, 2)) * weight)
-        return total, mse
+        return nll + decay + config.bound_decay * gap, (nll, mse)
 
     def project(network: NetworkParams) -> NetworkParams:
         floor = network.min_logvar + _MIN_BOUND_GAP
