@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import reference
 
 from jaxpets._src.moments import moments
@@ -17,6 +18,26 @@ def test_equal_the_reference_on_the_first_rows():
     np.testing.assert_allclose(mean, want_mean, rtol=1e-5)
     np.testing.assert_allclose(std, want_std, rtol=1e-5)
     assert std[1] == 1.0
+
+
+def test_a_constant_column_has_no_noise_of_rounding():
+    """Sums of most constants are not exact in float32."""
+    rows = jnp.broadcast_to(jnp.linspace(0.1, 1000.1, 60), (1000, 60))
+    mean, std = moments(rows, jnp.int32(1000))
+    np.testing.assert_array_equal(mean, rows[0])
+    np.testing.assert_array_equal(std, 1.0)
+
+
+@pytest.mark.parametrize("at", [0, 7])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_rows_that_are_not_finite_do_not_count(at, bad):
+    rows = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
+    spoilt = rows.copy()
+    spoilt[at, 1] = bad
+    got = moments(jnp.asarray(spoilt), jnp.int32(20))
+    rest = np.delete(rows, at, axis=0)
+    np.testing.assert_allclose(got[0], rest.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(got[1], rest.std(0), rtol=1e-4)
 
 
 def test_no_rows_give_the_identity():

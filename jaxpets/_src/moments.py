@@ -8,10 +8,16 @@ _MIN_STD = 1e-6
 
 
 def moments(rows: Array, size: Array) -> tuple[Array, Array]:
-    """Returns mean and std `[F]` of the first `size` rows of `[C, F]`; no std is 0."""
-    used = (jnp.arange(rows.shape[0]) < size)[:, None]
-    count = jnp.maximum(size, 1).astype(jnp.float32)
-    mean = jnp.sum(jnp.where(used, rows, 0.0), axis=0) / count
+    """Returns mean and std `[F]` of the first `size` rows of `[C, F]`; no std is 0.
+
+    A row that is not finite does not count.
+    """
+    used = (jnp.arange(rows.shape[0]) < size) & jnp.all(jnp.isfinite(rows), axis=1)
+    used = used[:, None]
+    count = jnp.maximum(jnp.sum(used), 1).astype(jnp.float32)
+    # From the first row, where the mean of a constant column is exact.
+    first = jnp.where(used[0], rows[0], 0.0)
+    mean = first + jnp.sum(jnp.where(used, rows - first, 0.0), axis=0) / count
     square = jnp.where(used, (rows - mean) ** 2, 0.0)
     std = jnp.sqrt(jnp.sum(square, axis=0) / count)
     return mean, jnp.where(std < _MIN_STD, 1.0, std)
