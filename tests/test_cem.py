@@ -157,6 +157,18 @@ def test_rejected_candidates_are_no_elites():
     assert -0.9 < solution.actions[0, 0] < -0.4
 
 
+def test_few_left_of_many_rejected_make_the_plan():
+    """Fewer than num_elites are left: the plan is their mean, not that of the rest."""
+
+    def value(actions):
+        return jnp.where(actions[:, 0, 0] < 0.9, jaxpets.WORST_VALUE, 1.0)
+
+    found = record(search(num_samples=60, num_iterations=1, momentum=0.0), value)
+    assert 0 < (found.values[0] > 0).sum() < 6
+    assert found.solution.value == 1.0
+    assert found.solution.actions[0, 0] >= 0.9
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
@@ -165,7 +177,7 @@ def test_rejected_candidates_are_no_elites():
         (dict(num_samples=5), "num_samples must be at least 6, got 5"),
         (dict(num_iterations=0), "num_iterations must be at least 1, got 0"),
         (dict(momentum=1.5), r"momentum must be in \[0, 1\], got 1.5"),
-        (dict(min_variance=-1.0), "min_variance must be in .* got -1.0"),
+        (dict(min_variance=-1.0), "min_variance must be finite and .* got -1.0"),
         (dict(action_low=ONE), "action_low and action_high .* low < high"),
         (dict(action_high=jnp.ones(3)), r"action_high must be float32\[2\]"),
         (dict(action_low=-jnp.ones(2, jnp.int32)), "action_low must be float32.*int32"),

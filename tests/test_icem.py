@@ -35,6 +35,18 @@ def rows(sequences):
     return {sequence.tobytes() for sequence in np.asarray(sequences)}
 
 
+@pytest.mark.parametrize("execute_best", [True, False])
+def test_few_left_of_many_rejected_make_the_plan(execute_best):
+    def value(actions):
+        return jnp.where(actions[:, 0, 0] < 0.9, jaxpets.WORST_VALUE, 1.0)
+
+    optimizer = search(num_iterations=1, momentum=0.0, execute_best=execute_best)
+    found = record(optimizer, value)
+    assert 0 < (found.values[0] > 0).sum() < 8
+    assert found.solution.value == 1.0
+    assert found.solution.actions[0, 0] >= 0.9
+
+
 # -- noise ---------------------------------------------------------------------------
 
 
@@ -196,10 +208,10 @@ def test_first_state_holds_the_middle_of_the_box():
         (dict(num_samples=7), "num_samples must be at least 8, got 7"),
         (dict(num_iterations=0), "num_iterations must be at least 1, got 0"),
         (dict(momentum=-0.1), r"momentum must be in \[0, 1\], got -0.1"),
-        (dict(noise_beta=-1.0), "noise_beta must be in .* got -1.0"),
-        (dict(init_std=0.0), "init_std must be in .* got 0.0"),
+        (dict(noise_beta=-1.0), "noise_beta must be finite and .* got -1.0"),
+        (dict(init_std=0.0), "init_std must be finite and .* got 0.0"),
         (dict(kept_fraction=1.1), r"kept_fraction must be in \[0, 1\], got 1.1"),
-        (dict(decay=0.5), "decay must be in .* got 0.5"),
+        (dict(decay=0.5), "decay must be finite and .* got 0.5"),
         (dict(action_low=ONE), "action_low and action_high .* low < high"),
     ],
 )

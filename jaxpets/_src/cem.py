@@ -10,8 +10,10 @@ from jaxpets._src.checks import (
     check_action_box,
     check_array,
     check_count,
+    check_flag,
     check_real,
 )
+from jaxpets._src.elites import select_elites
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
@@ -76,6 +78,7 @@ def cem(
     check_count("num_iterations", num_iterations)
     check_real("momentum", momentum, 0.0, 1.0)
     check_real("min_variance", min_variance, 0.0)
+    check_flag("legacy_variance", legacy_variance)
     center = (action_low + action_high) / 2
     half_width = (action_high - action_low) / 2
     shape = (horizon, center.shape[0])
@@ -83,7 +86,9 @@ def cem(
     def sample(key: Array, mean: Array, variance: Array) -> Array:
         margin = jnp.minimum(mean - action_low, action_high - mean)
         std = jnp.minimum(jnp.sqrt(variance), margin / 2)
-        noise = jax.random.truncated_normal(key, -2.0, 2.0, (num_samples, *shape))
+        noise = jax.random.truncated_normal(
+            key, -2.0, 2.0, (num_samples, *shape), jnp.float32
+        )
         # The clip only removes rounding: mean + 2 * std can pass the bound by one ulp.
         return jnp.clip(mean + std * noise, action_low, action_high)
 
@@ -101,17 +106,16 @@ def cem(
             actions = sample(sample_key, mean, variance)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [num_samples])
-            elite_values, elite_index = jax.lax.top_k(values, num_elites)
-            elites = actions[elite_index]
+            elites = select_elites(values, actions, num_elites)
             kept = 0.0 if legacy_variance else momentum
             new = (
                 jnp.clip(
-                    momentum * mean + (1 - momentum) * elites.mean(0),
+                    momentum * mean + (1 - momentum) * elites.mean,
                     action_low,
                     action_high,
                 ),
-                kept * variance + (1 - kept) * elites.var(0),
-                elite_values.mean(),
+                kept * variance + (1 - kept) * elites.variance,
+                elites.value,
             )
             searching = jnp.max(variance / half_width**2) > min_variance
             return jax.tree.map(

@@ -10,8 +10,10 @@ from jaxpets._src.checks import (
     check_action_box,
     check_array,
     check_count,
+    check_flag,
     check_real,
 )
+from jaxpets._src.elites import select_elites
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
@@ -76,6 +78,7 @@ def icem(
     check_real("init_std", init_std, 1e-6)
     check_real("kept_fraction", kept_fraction, 0.0, 1.0)
     check_real("decay", decay, 1.0)
+    check_flag("execute_best", execute_best)
     center = (action_low + action_high) / 2
     half_width = (action_high - action_low) / 2
     shape = (horizon, center.shape[0])
@@ -110,12 +113,12 @@ def icem(
             actions = jnp.concatenate(candidates)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [actions.shape[0]])
-            elite_values, elite_index = jax.lax.top_k(values, num_elites)
-            elites = actions[elite_index]
-            mean = momentum * mean + (1 - momentum) * elites.mean(0)
+            elites = select_elites(values, actions, num_elites)
+            mean = momentum * mean + (1 - momentum) * elites.mean
             mean = jnp.clip(mean, action_low, action_high)
-            std = momentum * std + (1 - momentum) * elites.std(0)
-            kept, best, value = elites[:num_kept], elites[0], elite_values.mean()
+            std = momentum * std + (1 - momentum) * jnp.sqrt(elites.variance)
+            kept, best = elites.actions[:num_kept], elites.actions[0]
+            value = elites.value
         assert best is not None and value is not None
         solution = Solution(actions=best if execute_best else mean, value=value)
         return solution, ICEMState(_shift(mean, center), _shift(kept, center))
