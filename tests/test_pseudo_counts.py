@@ -53,6 +53,15 @@ def test_counts_equal_a_dictionary(num_bits):
     np.testing.assert_allclose(bonus, [want.bonus(q) for q in queries], rtol=1e-5)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_blew_up_is_not_new(bad):
+    projection = simhash(jax.random.key(0), 16, D)
+    counts = count_states(projection, dataset_of(clustered()))
+    states = jnp.zeros((2, D)).at[1, 3].set(bad)
+    bonus = pseudo_count(counts, None, None, states)
+    assert bonus[0] > 0 and jnp.isnan(bonus[1])
+
+
 @pytest.mark.parametrize("num_bits", [1, 8, 16, 31, 32])
 def test_counts_sum_to_the_size(num_bits):
     states = clustered(seed=num_bits)

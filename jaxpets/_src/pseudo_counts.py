@@ -108,10 +108,12 @@ def pseudo_count(
       next_obs: `[E, P, D]`, or any leading shape.
 
     Returns:
-      `[E, P]`, the leading shape of next_obs.
+      `[E, P]`, the leading shape of next_obs; NaN where that is not finite: what blew
+      up was never seen, but is not new.
     """
     del obs, action
-    return jax.lax.rsqrt(1.0 + lookup(counts, next_obs).astype(jnp.float32))
+    novelty = jax.lax.rsqrt(1.0 + lookup(counts, next_obs).astype(jnp.float32))
+    return jnp.where(jnp.all(jnp.isfinite(next_obs), axis=-1), novelty, jnp.nan)
 
 
 def _hash(projection: Array, mean: Array, std: Array, obs: Array) -> Array:
