@@ -124,6 +124,9 @@ CASES = {
     "epistemic": lambda: Case(
         jaxpets.rewards.epistemic, lambda i: (jnp.full(2, i + 0.5), *step_of(i))
     ),
+    "information_gain": lambda: Case(
+        jaxpets.rewards.information_gain, lambda i: (jnp.full(2, i + 0.5), *step_of(i))
+    ),
     "pseudo_count": lambda: Case(
         jaxpets.rewards.pseudo_count, lambda i: (counts(i), *step_of(i))
     ),

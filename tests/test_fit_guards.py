@@ -53,6 +53,52 @@ def test_an_update_whose_loss_is_not_finite_is_dropped(
     assert jnp.isfinite(metrics.loss)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("entry", ["obs", "next_obs"])
+def test_metrics_are_means_over_the_updates_that_were_kept(
+    model, params, step, fitter, seed, entry
+):
+    """One bad row of forty: about what the clean data give, and no NaN."""
+    data = toys.transitions(40)
+    bad = getattr(data, entry).at[11].set(jnp.nan)
+
+    def run(data):
+        dataset = dataset_of(data)
+        return step(params, jax.random.key(seed), fitter.init(params), dataset)
+
+    _, _, clean = run(data)
+    _, _, spoilt = run(data._replace(**{entry: bad}))
+    assert spoilt.num_skipped < spoilt.num_updates
+    np.testing.assert_allclose(spoilt.loss, clean.loss, atol=1.0)
+    np.testing.assert_allclose(spoilt.mse, clean.mse, rtol=1.0)
+
+
+def test_metrics_without_an_update_that_was_kept_are_nan(params, step, fitter):
+    data = toys.transitions(40)
+    data = data._replace(next_obs=jnp.full_like(data.next_obs, jnp.nan))
+    after, _, metrics = step(
+        params, jax.random.key(0), fitter.init(params), dataset_of(data)
+    )
+    toys.assert_trees_close(after.network, params.network, rtol=0, atol=0)
+    assert metrics.num_skipped == metrics.num_updates
+    assert jnp.isnan(metrics.loss) and jnp.isnan(metrics.mse)
+
+
+@pytest.mark.parametrize("size", [5, 19, 24])
+def test_rows_behind_the_data_are_never_looked_at(size):
+    """Features that are not finite where the capacity is empty."""
+    space = jaxpets.delta_space()._replace(features=jnp.log)
+    model = toys.small_ensemble(space=space)
+    params = jax.jit(model.init)(jax.random.key(0))
+    data = jax.tree.map(lambda x: jnp.abs(x) + 0.1, toys.transitions(size))
+    config = FitConfig(num_epochs=2, batch_size=8, bootstrap=False)
+    fitter = jaxpets.fit(model, optax.adam(1e-3), config)
+    _, _, metrics = jax.jit(fitter.step)(
+        params, jax.random.key(0), fitter.init(params), dataset_of(data)
+    )
+    assert metrics.num_skipped == 0 and jnp.isfinite(metrics.loss)
+
+
 def test_the_model_stays_usable_after_a_bad_row(model, params, step, fitter):
     data = toys.transitions(40)
     data = data._replace(next_obs=data.next_obs.at[11].set(jnp.nan))

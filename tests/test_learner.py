@@ -40,6 +40,13 @@ def trial(number, key, state):
     return STEPS[min(number, 1)](jax.random.fold_in(key, number), state)
 
 
+def test_no_key_is_used_twice(key):
+    with jax.debug_key_reuse(True):
+        state = jax.jit(LEARNER.init)(key)
+        step = jax.jit(lambda key, state: LEARNER.step(EXPLORER, key, state))
+        step(jax.random.fold_in(key, 0), state)
+
+
 def test_starts_with_nothing_but_a_model(key):
     state = INIT(key)
     assert state.dataset.size == 0

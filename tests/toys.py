@@ -122,7 +122,7 @@ def _recording(search, value_fn):
     return jax.jit(step), kept
 
 
-def small_ensemble(*, obs_size=2, action_size=1, **changes):
+def small_ensemble(*, obs_size=2, action_size=1, space=None, **changes):
     """An ensemble that trains in a second."""
     settings = dict(
         num_members=3,
@@ -131,9 +131,8 @@ def small_ensemble(*, obs_size=2, action_size=1, **changes):
         precision=jaxpets.Precision.F32,
     )
     config = jaxpets.EnsembleConfig(**(settings | changes))
-    return jaxpets.ensemble(
-        config, jaxpets.delta_space(), obs_size=obs_size, action_size=action_size
-    )
+    space = space or jaxpets.delta_space()
+    return jaxpets.ensemble(config, space, obs_size=obs_size, action_size=action_size)
 
 
 def transitions(length, obs_size=2, action_size=1, seed=0):

@@ -56,6 +56,7 @@ class FitMetrics(NamedTuple):
 
     loss: Array  # [] mean over the last epoch, without the penalties of `Ensemble.loss`
     mse: Array  # [] mean squared error of the mean, over members and dimensions
+    # Both leave out dropped updates, and are NaN if all of an epoch were dropped.
     num_updates: Array  # [] int32
     num_skipped: Array  # [] int32, updates dropped because the loss was not finite
 
@@ -141,11 +142,8 @@ def fit(
         inputs, targets = ensemble.encode(scaler, dataset.data)
         num_members = jax.tree.leaves(params.network.members)[0].shape[0]
         shape = (num_members, inputs.shape[0])
-        bootstrap_key, epochs_key = jax.random.split(key)
-        if config.bootstrap:
-            shown = jax.random.randint(bootstrap_key, shape, 0, jnp.maximum(size, 1))
-        else:
-            shown = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32), shape)
+        shown_key, epochs_key = jax.random.split(key)
+        shown = _shown(shown_key, config, shape, size)
         num_batches = (size + batch_size - 1) // batch_size
 
         def epoch(carry: tuple, inputs_: tuple) -> tuple[tuple, None]:
@@ -158,7 +156,9 @@ def fit(
             def batch(i: Array, carry: tuple) -> tuple:
                 network, opt_state, skipped, totals = carry
                 position = i * batch_size + jnp.arange(batch_size, dtype=jnp.int32)
-                picked = jnp.take(rows, position, axis=1, mode="clip")
+                # Past the data lies what need not be finite, which no weight masks.
+                within = jnp.minimum(position, size - 1)
+                picked = jnp.take(rows, within, axis=1, mode="clip")
                 used = (position < size).astype(jnp.float32)
                 count = jnp.float32(jnp.clip(size - i * batch_size, 0, batch_size))
                 has_rows = count > 0.0
@@ -168,10 +168,11 @@ def fit(
                     (number + i / jnp.maximum(num_batches, 1)) / config.num_epochs,
                 )  # fmt: skip
                 bad = jnp.logical_not(jnp.isfinite(loss)) & has_rows
-                share = count / size.astype(jnp.float32)
+                counts = has_rows & jnp.logical_not(bad)
                 totals = jax.tree.map(
-                    lambda t, x: t + jnp.where(bad, 0.0, x) * share, totals, (loss, mse)
-                )
+                    lambda t, x: t + jnp.where(counts, count * x, 0.0),
+                    totals, (loss, mse, jnp.ones_like(loss)),
+                )  # fmt: skip
                 return network, opt_state, skipped + bad.astype(jnp.int32), totals
 
             def batches(i: Array, carry: tuple) -> tuple:
@@ -182,7 +183,7 @@ def fit(
                 return jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, carry)
 
             zero = jnp.zeros((), jnp.float32)
-            carry = (network, opt_state, skipped, (zero, zero))
+            carry = (network, opt_state, skipped, (zero, zero, zero))
             num_turns = (num_batches + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
             return jax.lax.fori_loop(0, num_turns, batches, carry), None
 
@@ -191,18 +192,24 @@ def fit(
             params.network,
             state.opt_state,
             jnp.zeros((), jnp.int32),
-            (zero, zero),
+            (zero, zero, zero),
         )
         keys = jax.random.split(epochs_key, config.num_epochs)
         epochs = (jnp.arange(config.num_epochs, dtype=jnp.float32), keys)
-        (network, opt_state, skipped, (loss, mse)), _ = jax.lax.scan(
-            epoch, carry, epochs
-        )
+        (network, opt_state, skipped, totals), _ = jax.lax.scan(epoch, carry, epochs)
+        loss, mse = (jnp.where(size > 0, x / totals[2], 0.0) for x in totals[:2])
         num_updates = (num_batches * config.num_epochs).astype(jnp.int32)
         metrics = FitMetrics(loss, mse, num_updates, skipped)
         return EnsembleParams(network, scaler), FitState(opt_state), metrics
 
     return Fitter(init, step)
+
+
+def _shown(key: Array, config: FitConfig, shape: tuple[int, int], size: Array) -> Array:
+    """Returns which rows each member is shown, `[E, C]`, of which `size` count."""
+    if config.bootstrap:
+        return jax.random.randint(key, shape, 0, jnp.maximum(size, 1))
+    return jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32), shape)
 
 
 def _annealed(final: float, done: Array) -> Array:
