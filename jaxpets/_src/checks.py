@@ -33,17 +33,21 @@ def check_counts(name: str, values: Any) -> None:
 
 def check_flag(name: str, value: Any) -> None:
     """Raises unless `value` is True or False; a traced one cannot choose a program."""
-    if not isinstance(value, bool):
+    if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{name} must be True or False, got {value!r}.")
 
 
 def check_real(name: str, value: Any, low: float, high: float = math.inf) -> None:
     """Raises unless `value` is a finite Python number in `[low, high]`."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)):
+    numbers = (int, float, np.integer, np.floating)
+    if isinstance(value, bool) or not isinstance(value, numbers):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python float, got {value!r} ({kind}).")
     if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value!r}.")
+        valid = f"in [{low:g}, {high:g}]"
+        if high == math.inf:
+            valid = f"finite and at least {low:g}"
+        raise ValueError(f"{name} must be {valid}, got {value!r}.")
 
 
 def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> None:

@@ -41,6 +41,9 @@ class EnsembleConfig:
     def __post_init__(self) -> None:
         check_count("num_members", self.num_members)
         check_counts("hidden_sizes", self.hidden_sizes)
+        if not isinstance(self.weight_decays, (tuple, list)):
+            got = repr(self.weight_decays)
+            raise TypeError(f"weight_decays must be a tuple of floats, got {got}.")
         if len(self.weight_decays) != len(self.hidden_sizes) + 1:
             raise ValueError(
                 "weight_decays must have one entry per layer "

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array
+from jaxpets._src.checks import check_array, check_flag
 from jaxpets._src.chunks import WINDOW
 from jaxpets._src.ensemble import (
     EnsembleConfig,
@@ -69,6 +69,7 @@ def fused_rollout(
     Raises:
       TypeError, ValueError: as `ensemble` and `particle_rollout`.
     """
+    check_flag("interpret", interpret)
     model = ensemble(config, space, obs_size=obs_size, action_size=action_size)
     scan = particle_rollout(
         model.sample, num_members=config.num_members, num_particles=num_particles

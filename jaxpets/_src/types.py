@@ -58,7 +58,7 @@ class PlanOutput(NamedTuple):
 
     action: Array  # [A] to execute now
     actions: Array  # [H, A] the whole plan
-    value: Array  # [] the plan's return under the model, summed over the horizon
+    value: Array  # [] return under the model, summed over the horizon, see Solution
 
 
 class EnvState(NamedTuple):

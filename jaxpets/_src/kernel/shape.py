@@ -55,6 +55,8 @@ class KernelShape:
 
     def problem(self) -> str | None:
         """Returns why no kernel has this shape, or None."""
+        if not self.hidden_sizes:
+            return "there is no hidden layer"
         if self.width > _MAX_COLUMNS:
             return f"hidden layers are wider than {_MAX_COLUMNS}"
         if 2 * self.head > _MAX_COLUMNS:
