@@ -139,18 +139,22 @@ def from_json(data: dict[str, Any], default: Config) -> Config:
 
 
 def differences(
-    old: dict[str, Any], new: dict[str, Any], ignore: Sequence[str]
-) -> list[str]:
+    old: dict[str, Any], new: dict[str, Any], ignore: Sequence[str],
+    default: dict[str, Any],
+) -> list[str]:  # fmt: skip
     """Returns what differs between two configs in JSON, as `field: old vs new`.
 
-    An entry that only one of them has is of another version and cannot differ.
+    A version that did not know an entry did what its default, in JSON, stands for. It
+    cannot differ in an entry that only `old` has, or in a group of them it lacks.
     """
     lines = []
-    for name in sorted({*old} & {*new} - set(ignore)):
-        before, now = old[name], new[name]
-        if isinstance(before, dict) and isinstance(now, dict):
-            lines += [f"{name}.{line}" for line in differences(before, now, ())]
-        elif before != now:
+    for name in sorted({*new} - set(ignore)):
+        now = new[name]
+        if isinstance(now, dict):
+            before = old.get(name, now)
+            groups = differences(before, now, (), default.get(name, {}))
+            lines += [f"{name}.{line}" for line in groups]
+        elif (before := old.get(name, default.get(name, now))) != now:
             lines.append(f"{name}: {before} (there) vs {now} (now)")
     return lines
 
@@ -239,7 +243,11 @@ def _explored(first: argparse.Namespace, default: Config) -> Config:
             f"there is no exploration run in {folder}. Run --phase explore first, or "
             "name a run with --from."
         )
-    explored = from_json(rundir.read_json(path), default)
+    data = rundir.read_json(path)
+    # What an older version did not write is that of the run's preset and arm, not of
+    # those that happen to be said again.
+    own = from_json(data, default)
+    explored = from_json(data, numbers_of(own.preset, own.arm))
     return dataclasses.replace(explored, **dict.fromkeys(_PLACE))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from experiments import cli, rundir
 from experiments.errors import CheckpointError, InterruptedRun, RunError
+from experiments.presets import PRESETS
 
 # Two checkpoints and one being written, of a paper-sized run of one seed and task.
 _NEEDED_BYTES = 64 * 2**20
@@ -64,7 +65,8 @@ def open_run(
 
 def _compare(path: Path, config: dict[str, Any], ignore: Sequence[str]) -> None:
     if path.exists():
-        lines = cli.differences(rundir.read_json(path), config, ignore)
+        default = cli.to_json(PRESETS["paper"])  # the field's own, in every preset
+        lines = cli.differences(rundir.read_json(path), config, ignore, default)
         if lines:
             another = "--name" if config["phase"] == "explore" else "--tag"
             raise CheckpointError(

@@ -7,9 +7,9 @@ import pytest
 
 from experiments import cli
 from experiments.config import Config
-from experiments.errors import CheckpointError
+from experiments.errors import CheckpointError, OutOfMemoryError
 from experiments.presets import PRESETS
-from experiments.run import main
+from experiments.run import _plain_errors, main
 
 SMOKE = ("--phase", "explore", "--preset", "smoke")
 LATER = ("--phase", "zero-shot", "--preset", "smoke")
@@ -243,12 +243,69 @@ def test_configs_survive_json(preset, tmp_path):
 def test_differences_name_the_field():
     old = cli.to_json(dataclasses.replace(PRESETS["smoke"], phase="explore"))
     new = json.loads(json.dumps(old))
-    assert cli.differences(old, new, ()) == []
+    default = cli.to_json(PRESETS["paper"])
+    assert cli.differences(old, new, (), default) == []
     new["planner"]["horizon"], new["seeds"], new["debug"] = 5, [1], True
-    assert cli.differences(old, new, ("debug",)) == [
+    assert cli.differences(old, new, ("debug",), default) == [
         "planner.horizon: 3 (there) vs 5 (now)",
         "seeds: [0] (there) vs [1] (now)",
     ]
+
+
+def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
+    explored(out)
+    huge = ("--task-planner.num-samples", "1000000", "--task-planner.horizon", "1000")
+    code, line = fail(*LATER, *huge)
+    assert code == 2
+    assert "--phase zero-shot of --preset smoke would take about 3 hours" in line
+
+
+@pytest.mark.parametrize(
+    ("changes", "planned", "flags"),
+    [
+        (dict(phase="explore"), "1 trials", "--seeds, --planner.num-samples"),
+        (
+            dict(phase="zero-shot", task="forward", eval_trials=5),
+            "5 trials",
+            "--seeds, --eval-trials, --task-planner.num-samples",
+        ),
+        (dict(phase="finetune"), "4 trials", "--seeds, --task-planner.num-samples"),
+    ],
+)
+def test_out_of_memory_names_the_flags_of_the_phase(changes, planned, flags):
+    config = dataclasses.replace(PRESETS["smoke"], **changes)
+    with pytest.raises(OutOfMemoryError) as error, _plain_errors(config):
+        raise MemoryError
+    assert f"1 seeds x {planned} x 8 samples x 3 particles" in str(error.value)
+    assert f"lower one of {flags}, --" in str(error.value)
+
+
+@pytest.mark.parametrize("said", [(), ("--preset", "paper", "--arm", "best")])
+def test_what_an_older_run_lacks_is_that_of_its_preset_and_arm(out, said):
+    path = explored(out, name="mine", preset="paper", arm="best")
+    data = json.loads(path.read_text())
+    del data["refit"]["bootstrap"], data["tuning"]
+    path.write_text(json.dumps(data))
+    flags = ("--phase", "finetune", "--from", str(path.parent), *said)
+    config = cli.parse(flags)
+    assert not config.refit.bootstrap
+    assert config.refit.num_epochs == PRESETS["smoke"].refit.num_epochs  # as recorded
+    assert config.tuning == PRESETS["paper"].tuning
+
+
+def test_what_an_older_version_did_not_write_was_the_default():
+    default = cli.to_json(dataclasses.replace(PRESETS["paper"], phase="explore"))
+    old = json.loads(json.dumps(default))
+    del old["refit"]["bootstrap"], old["pessimism"], old["tuning"]
+    assert cli.differences(old, default, (), default) == []
+    new = {**default, "pessimism": 3.0}
+    new["refit"] = {**default["refit"], "bootstrap": False}
+    assert cli.differences(old, new, (), default) == [
+        "pessimism: 0.0 (there) vs 3.0 (now)",
+        "refit.bootstrap: True (there) vs False (now)",
+    ]
+    # What only the older one has is nothing this version could do differently.
+    assert cli.differences({**old, "colour": 1}, default, (), default) == []
 
 
 @pytest.mark.parametrize("flags", [(), SMOKE, LATER])
