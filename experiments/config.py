@@ -113,7 +113,7 @@ class Config:
     """Use the explored model as it was after this trial; by default the last."""
     tag: str | None = None
     """Name of another attempt at phase 2, with other numbers: it has a folder of its
-    own in the run, and a row of its own in the report."""
+    own in the run, and, if it is a zero-shot, a row of its own in the report."""
     video: Path | None = None
     """Render a trial of each task to this mp4 (zero-shot and finetune)."""
     num_trials: int = number(60, 1, 100_000)
@@ -147,7 +147,7 @@ class Config:
     process_id: int | None = number(None, 0, 99_999)
     """Which of them this is; only the folder of process 0 is used."""
     allow_cpu: bool = False
-    """Start on a CPU although it would take over an hour."""
+    """Start on a CPU although planning would take over an hour."""
     debug: bool = False
     """Show tracebacks."""
     model: ModelNumbers = ModelNumbers()

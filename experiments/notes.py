@@ -133,14 +133,18 @@ def _unequal(runs: dict[Path, str]) -> Iterator[str]:
     for phase in sorted(set(runs.values())):
         skipped = _NOT_SETTINGS | _FOR_LATER.get(phase, set())
         values: dict[str, dict[str, set[str]]] = {}
+        labels = set()
         for run in sorted(run for run in runs if runs[run] == phase):
+            label = run.parent.name if phase != "explore" else run.name
+            labels.add(label)
             for name, value in flat(read_json(run / "config.json")).items():
                 if name.split(".")[0] not in skipped:
-                    label = run.parent.name if phase != "explore" else run.name
                     by_value = values.setdefault(name, {})
                     by_value.setdefault(str(value), set()).add(label)
         for name, by_value in values.items():
             if len(by_value) > 1:
+                if silent := labels.difference(*by_value.values()):
+                    by_value["not recorded"] = silent
                 each = "; ".join(
                     f"{v} ({_list(sorted(r))})" for v, r in by_value.items()
                 )

@@ -1,9 +1,10 @@
 """`python -m experiments.pretrained RUN NAME`: ships an explored model with the code.
 
-Of a run are kept its config, environment and log, and the model that performed in its
-last zero-shot: enough for `--phase zero-shot --from pretrained/NAME`, not to learn on.
-Tasks are planned with the numbers of the preset `laptop` and a longer horizon, a trial
-each, so that a laptop is enough; flags bring back the run's own.
+Of a run are kept its config, environment and log, the model that performed in its last
+zero-shot, and config and environment of that: enough for `--phase zero-shot --from
+pretrained/NAME`, not to learn on. Tasks are planned with the numbers of the preset
+`laptop` and a longer horizon, a trial each, so that a laptop is enough; flags bring the
+run's own back.
 """
 
 import argparse
@@ -44,7 +45,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
         raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
-    step, state = _performed(run, config)
+    performed, step, state = _performed(run, config)
     i = config.seeds.index(seed)
     state = jax.tree.map(lambda x: x[i : i + 1], state)
     shipped = dataclasses.replace(
@@ -58,6 +59,8 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     checkpoint.save(folder / "checkpoints", step, state, {}, finite=state)
     rundir.write_json(folder / "config.json", cli.to_json(shipped))
     shutil.copyfile(run / "env.json", folder / "env.json")
+    for file in ("config.json", "env.json"):  # how the model came to be what it is
+        shutil.copyfile(performed / file, folder / f"performed-{file}")
     rows = (run / "metrics.jsonl").read_text().splitlines()
     rundir.append_rows(
         folder / "metrics.jsonl",
@@ -66,8 +69,8 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     return folder
 
 
-def _performed(run: Path, config: Config) -> tuple[int, phases.State]:
-    """Returns the model `[S]` of the last zero-shot, and after which trial it was.
+def _performed(run: Path, config: Config) -> tuple[Path, int, phases.State]:
+    """Returns the folder of the last zero-shot, its trial, and the model `[S]` of it.
 
     That of all tasks and without a tag, if there is one.
     """
@@ -77,11 +80,11 @@ def _performed(run: Path, config: Config) -> tuple[int, phases.State]:
     ]
     if not performed:
         raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
-    last = max(performed, key=_rank) / "checkpoints"
+    last = max(performed, key=_rank)
     template = phases.model_of(phases.explored_template(config, build(config)))
-    found = checkpoint.restore(last, template, warn=print)
+    found = checkpoint.restore(last / "checkpoints", template, warn=print)
     assert found is not None
-    return found[:2]
+    return last, *found[:2]
 
 
 def _rank(folder: Path) -> tuple[int, bool, bool, str]:

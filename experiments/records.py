@@ -83,9 +83,14 @@ def save_paths(
 
 
 def describe(rows: Sequence[dict[str, Any]]) -> str:
-    """Returns one line: the mean over rows of returns and value."""
-    names = half_cheetah.TASK_NAMES
-    means = {name: np.mean([row["returns"][name] for row in rows]) for name in names}
-    parts = [f"{name} {value:.0f}" for name, value in means.items()]
+    """Returns one line: mean value and returns, of a task over the rows that sought it.
+
+    Rows without a task, those of exploration, count for all.
+    """
+    parts = []
+    for name in half_cheetah.TASK_NAMES:
+        own = [row["returns"][name] for row in rows if row.get("task", name) == name]
+        if own:
+            parts.append(f"{name} {np.mean(own):.0f}")
     value = np.mean([row["value"] for row in rows])
     return "  ".join([f"value {value:.3g}", "returns:", *parts])

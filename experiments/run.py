@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from experiments import cli, hosts, session
-from experiments.config import Config
+from experiments.config import Config, PlannerNumbers
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -53,6 +53,7 @@ def _dispatch(config: Config) -> None:
             _say(f"wrote {path}")
         return
     source = cli.explored_run(config)
+    _check_cpu(config)
     if config.phase == "explore":
         _explore(config, source)
         return
@@ -75,7 +76,6 @@ def _attempt(config: Config, step: int) -> str:
 
 
 def _explore(config: Config, folder: Path) -> None:
-    _check_cpu(config)
     with _without_gl(), stoppable(), _opened(config, folder):
         from experiments import phases
 
@@ -132,20 +132,30 @@ def _check_cpu(config: Config) -> None:
     """Refuses what would take over an hour on a CPU by mistake."""
     import jax
 
-    if jax.default_backend() != "cpu" or config.allow_cpu or config.arm == "random":
+    if jax.default_backend() != "cpu" or config.allow_cpu:
         return
-    planner, model = config.planner, config.model
+    trials = {
+        "explore": config.num_trials - config.random_trials,
+        "zero-shot": config.eval_trials,
+        "finetune": config.finetune_trials,
+    }[config.phase]
+    length = config.task_length
+    if config.phase == "explore":
+        length = config.trial_length
+        trials *= config.arm != "random"  # which plans nothing
+    _, planner = _search(config)
+    model = config.model
     width = model.hidden_size
     products = 24 * width + (model.num_layers - 1) * width**2 + width * 36
     rows = planner.num_samples * planner.num_particles * planner.num_iterations
-    steps = (config.num_trials - config.random_trials) * config.trial_length
+    steps = _num_tasks(config) * trials * length
     hours = (
         2 * products * rows * planner.horizon * steps * len(config.seeds) / 1e11 / 3600
     )
     if hours > 1:
         raise UsageError(
-            f"--preset {config.preset} would take about {hours:.0f} hours on this CPU; "
-            "use a GPU, a smaller preset or --allow-cpu."
+            f"--phase {config.phase} of --preset {config.preset} would take about "
+            f"{hours:.0f} hours on this CPU; use a GPU, smaller numbers or --allow-cpu."
         )
 
 
@@ -181,15 +191,30 @@ def _without_gl() -> Iterator[None]:
 
 
 def _memory_advice(config: Config) -> str:
-    exploring = config.phase == "explore"
-    planner = config.planner if exploring else config.task_planner
-    trials = 4 * config.eval_trials if config.phase == "zero-shot" else 1
+    flag, planner = _search(config)
+    trials = _num_tasks(config)
+    flags = ["--seeds", f"--{flag}.num-samples", f"--{flag}.num-particles"]
+    if config.phase == "zero-shot":
+        trials *= config.eval_trials
+        flags.insert(1, "--eval-trials")
     return (
         f"out of memory. {len(config.seeds)} seeds x {trials} trials x "
         f"{planner.num_samples} samples x {planner.num_particles} particles x horizon "
-        f"{planner.horizon} are planned at once; lower one of --seeds, --eval-trials, "
-        "--planner.num-samples, --planner.num-particles. The last checkpoint is intact."
+        f"{planner.horizon} are planned at once; lower one of {', '.join(flags)}. The "
+        "last checkpoint is intact."
     )
+
+
+def _search(config: Config) -> tuple[str, PlannerNumbers]:
+    """Returns the search of a phase, and what its flags are called."""
+    if config.phase == "explore":
+        return "planner", config.planner
+    return "task-planner", config.task_planner
+
+
+def _num_tasks(config: Config) -> int:
+    """Returns how many tasks are planned for at once; exploration is one."""
+    return 4 if config.phase != "explore" and config.task == "all" else 1
 
 
 def _say(text: str) -> None:

@@ -79,6 +79,14 @@ def test_a_shipped_model_acts_as_its_run(explored, shelf, tmp_path, capsys):
     assert all(np.isfinite(list(want.values())))
 
 
+def test_a_shipped_model_says_how_it_came_to_be(explored, shelf):
+    pretrained.ship(explored, "mine")
+    performed = explored / "zero-shot-003-front-flip"
+    for file in ("config.json", "env.json"):
+        kept = shelf / "mine" / f"performed-{file}"
+        assert kept.read_bytes() == (performed / file).read_bytes()
+
+
 def test_only_the_model_is_there(explored, shelf, tmp_path, capsys):
     pretrained.main([str(explored), "mine"])
     for flags, words in (

@@ -272,6 +272,17 @@ def test_runs_of_other_seeds_are_pooled(out):
     assert "learning_rate is 0.1 (laptop-epistemic); 0.5 (more)" in text
 
 
+def test_a_setting_that_a_run_did_not_record_is_named(tmp_path):
+    for arm, refit in (("count", {"bootstrap": True}), ("best", {"bootstrap": False})):
+        write_arm(tmp_path / "runs", arm, [1.0], refit=refit)
+    write_arm(tmp_path / "runs", "random", [1.0])
+    text, _ = report_of(tmp_path / "runs")
+    assert (
+        "zero-shot: refit.bootstrap is False (laptop-best); True (laptop-count" in text
+    )
+    assert "); not recorded (laptop-random)." in text
+
+
 def test_what_a_phase_does_not_use_may_differ_in_it(tmp_path):
     for arm, horizon in (("epistemic", 20), ("best", 30)):
         write_arm(tmp_path / "runs", arm, [1.0], task_planner={"horizon": horizon})
