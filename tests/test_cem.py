@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -155,6 +156,17 @@ def test_rejected_candidates_are_no_elites():
     assert solution.value > -1.0
     # 0.9 of the elites' mean, which lies around -0.7, plus 0.1 of the old mean, 0.
     assert -0.9 < solution.actions[0, 0] < -0.4
+
+
+def test_draws_in_float32_where_64_bits_are_enabled():
+    optimizer = search()
+    with jax.enable_x64(True):
+        solution, _ = optimizer.step(
+            lambda key, actions: -jnp.sum(actions**2, (1, 2)),
+            jax.random.key(0),
+            optimizer.init(),
+        )
+    assert solution.actions.dtype == solution.value.dtype == jnp.float32
 
 
 def test_few_left_of_many_rejected_make_the_plan():

@@ -22,7 +22,7 @@ def test_count_names_argument_minimum_and_value():
         checks.check_count("num_elites", 1, minimum=2)
 
 
-@pytest.mark.parametrize("value", [0.0, 1, 0.5, np.float32(0.25)])
+@pytest.mark.parametrize("value", [0.0, 1, 0.5, np.float32(0.25), np.int64(0)])
 def test_real_takes_numbers_in_range(value):
     checks.check_real("momentum", value, 0.0, 1.0)
 
@@ -31,6 +31,23 @@ def test_real_takes_numbers_in_range(value):
 def test_real_refuses_what_is_out_of_range(value):
     with pytest.raises(ValueError, match=r"momentum must be in \[0, 1\], got"):
         checks.check_real("momentum", value, 0.0, 1.0)
+
+
+def test_real_without_a_greatest_value_says_so():
+    for value in (-1.0, float("inf")):
+        with pytest.raises(ValueError, match="decay must be finite and at least 0"):
+            checks.check_real("decay", value, 0.0)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, False])
+def test_flag_takes_booleans(value):
+    checks.check_flag("legacy", value)
+
+
+@pytest.mark.parametrize("value", [1, "no", None, jnp.bool_(True)])
+def test_flag_refuses_what_is_true_by_chance(value):
+    with pytest.raises(TypeError, match="legacy must be True or False, got"):
+        checks.check_flag("legacy", value)
 
 
 @pytest.mark.parametrize("value", [True, "0.5", None])

@@ -247,17 +247,22 @@ def test_delta_space_obeys_its_law():
         (dict(hidden_sizes=200), TypeError, "hidden_sizes must be .*200"),
         (dict(hidden_sizes=(200,)), ValueError, r"weight_decays must have .*\(2\).* 5"),
         (
+            dict(weight_decays=1e-4),
+            TypeError,
+            "weight_decays must be a tuple",
+        ),
+        (
             dict(weight_decays=(1.0, 1.0, 1.0, 1.0, -1.0)),
             ValueError,
             "weight_decays mu",
         ),
-        (dict(bound_decay=-0.1), ValueError, "bound_decay must be in"),
+        (dict(bound_decay=-0.1), ValueError, "bound_decay must be finite"),
         (
             dict(precision="bf16"),
             TypeError,
             "precision must be a Precision, got 'bf16'",
         ),
-        (dict(state_margin=-1.0), ValueError, "state_margin must be in"),
+        (dict(state_margin=-1.0), ValueError, "state_margin must be finite"),
     ],
 )
 def test_bad_settings_fail_when_built(changes, error, text):

@@ -171,6 +171,7 @@ def test_a_small_model_stays_in_shared_memory():
     ("shape", "problem"),
     [
         (KernelShape(18, 6, 18, (256, 8)), None),
+        (KernelShape(18, 6, 18, ()), "there is no hidden layer"),
         (KernelShape(18, 6, 18, (8, 257)), "hidden layers are wider than 256"),
         (KernelShape(128, 6, 18, (64,)), None),
         (KernelShape(129, 6, 18, (64,)), "observations have more than 128 entries"),

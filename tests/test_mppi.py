@@ -125,8 +125,8 @@ def test_finds_the_optimum_of_a_quadratic(key):
         (dict(horizon=0), "horizon must be at least 1, got 0"),
         (dict(num_samples=1), "num_samples must be at least 2, got 1"),
         (dict(num_iterations=0), "num_iterations must be at least 1, got 0"),
-        (dict(std=0.0), "std must be in .* got 0.0"),
-        (dict(temperature=0.0), "temperature must be in .* got 0.0"),
+        (dict(std=0.0), "std must be finite and .* got 0.0"),
+        (dict(temperature=0.0), "temperature must be finite and .* got 0.0"),
         (dict(action_low=ONE), "action_low and action_high .* low < high"),
     ],
 )
