@@ -17,6 +17,7 @@ LAYERS = {
     "_src.types": 0,
     "_src.checks": 0,
     "_src.moments": 0,
+    "_src.elites": 0,
     "_src.chunks": 0,
     "_src.network": 0,
     "_src.kernel": 0,

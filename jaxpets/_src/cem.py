@@ -14,7 +14,7 @@ from jaxpets._src.checks import (
     check_real,
 )
 from jaxpets._src.elites import select_elites
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
 
 
 class CEMState(NamedTuple):
@@ -106,7 +106,7 @@ def cem(
             actions = sample(sample_key, mean, variance)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [num_samples])
-            elites = select_elites(values, actions, num_elites)
+            elites = select_elites(values, actions, num_elites, WORST_VALUE)
             kept = 0.0 if legacy_variance else momentum
             new = (
                 jnp.clip(

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.types import WORST_VALUE
-
 
 class Elites(NamedTuple):
     """The best K of N candidates; the statistics leave out what was rejected."""
@@ -18,24 +16,27 @@ class Elites(NamedTuple):
     value: Array  # [] mean
 
 
-def select_elites(values: Array, actions: Array, num_elites: int) -> Elites:
+def select_elites(
+    values: Array, actions: Array, num_elites: int, worst: float
+) -> Elites:
     """Selects the best candidates.
 
-    A candidate whose imagined future is not finite is rejected: it has WORST_VALUE. It
-    may be an elite where fewer than K are left, but it does not move the search, unless
-    all are rejected.
+    A candidate whose imagined future is not finite is rejected: it has the worst value.
+    It may be an elite where fewer than K are left, but it does not move the search,
+    unless all are rejected.
 
     Args:
       values: `[N]`, finite.
       actions: `[N, H, A]`.
       num_elites: K.
+      worst: value of what is rejected.
 
     Returns:
       Elites.
     """
     best, index = jax.lax.top_k(values, num_elites)
     elites = actions[index]
-    kept = (best > WORST_VALUE) | jnp.all(best <= WORST_VALUE)
+    kept = (best > worst) | jnp.all(best <= worst)
     kept = kept.astype(jnp.float32)
     share = kept / jnp.sum(kept)
     weight = share[:, None, None]

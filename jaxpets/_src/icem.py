@@ -14,7 +14,7 @@ from jaxpets._src.checks import (
     check_real,
 )
 from jaxpets._src.elites import select_elites
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
 
 
 class ICEMState(NamedTuple):
@@ -113,7 +113,7 @@ def icem(
             actions = jnp.concatenate(candidates)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [actions.shape[0]])
-            elites = select_elites(values, actions, num_elites)
+            elites = select_elites(values, actions, num_elites, WORST_VALUE)
             mean = momentum * mean + (1 - momentum) * elites.mean
             mean = jnp.clip(mean, action_low, action_high)
             std = momentum * std + (1 - momentum) * jnp.sqrt(elites.variance)
