@@ -50,6 +50,14 @@ def check_real(name: str, value: Any, low: float, high: float = math.inf) -> Non
         raise ValueError(f"{name} must be {valid}, got {value!r}.")
 
 
+def check_reals(name: str, values: Any, low: float) -> None:
+    """Raises unless `values` is a tuple or list of finite numbers of at least `low`."""
+    if not isinstance(values, (tuple, list)):
+        raise TypeError(f"{name} must be a tuple of floats, got {values!r}.")
+    for value in values:
+        check_real(name, value, low)
+
+
 def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> None:
     """Raises unless `value` is a float32 array of `shape`.
 

@@ -16,6 +16,11 @@ class Elites(NamedTuple):
     value: Array  # [] mean
 
 
+def not_rejected(values: Array, worst: float) -> Array:
+    """Tells which of `values` `[N]` are better than the worst; if none is, all pass."""
+    return (values > worst) | jnp.all(values <= worst)
+
+
 def select_elites(
     values: Array, actions: Array, num_elites: int, worst: float
 ) -> Elites:
@@ -36,8 +41,7 @@ def select_elites(
     """
     best, index = jax.lax.top_k(values, num_elites)
     elites = actions[index]
-    kept = (best > worst) | jnp.all(best <= worst)
-    kept = kept.astype(jnp.float32)
+    kept = not_rejected(best, worst).astype(jnp.float32)
     share = kept / jnp.sum(kept)
     weight = share[:, None, None]
     mean = jnp.sum(weight * elites, axis=0)

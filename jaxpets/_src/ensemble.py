@@ -8,7 +8,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count, check_counts, check_real
+from jaxpets._src.checks import (
+    check_array,
+    check_count,
+    check_counts,
+    check_real,
+    check_reals,
+)
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Network, Precision
 from jaxpets._src.types import DynamicsFn, ModelSpace, Transition
@@ -41,16 +47,12 @@ class EnsembleConfig:
     def __post_init__(self) -> None:
         check_count("num_members", self.num_members)
         check_counts("hidden_sizes", self.hidden_sizes)
-        if not isinstance(self.weight_decays, (tuple, list)):
-            got = repr(self.weight_decays)
-            raise TypeError(f"weight_decays must be a tuple of floats, got {got}.")
+        check_reals("weight_decays", self.weight_decays, 0.0)
         if len(self.weight_decays) != len(self.hidden_sizes) + 1:
             raise ValueError(
                 "weight_decays must have one entry per layer "
                 f"({len(self.hidden_sizes) + 1}), got {len(self.weight_decays)}."
             )
-        for decay in self.weight_decays:
-            check_real("weight_decays", decay, 0.0)
         check_real("bound_decay", self.bound_decay, 0.0)
         if not isinstance(self.precision, Precision):
             raise TypeError(f"precision must be a Precision, got {self.precision!r}.")

@@ -52,11 +52,13 @@ class FitState(NamedTuple):
 
 
 class FitMetrics(NamedTuple):
-    """How the last call went."""
+    """How the last call went.
+
+    Losses leave out dropped updates, and are NaN if all of an epoch were dropped.
+    """
 
     loss: Array  # [] mean over the last epoch, without the penalties of `Ensemble.loss`
     mse: Array  # [] mean squared error of the mean, over members and dimensions
-    # Both leave out dropped updates, and are NaN if all of an epoch were dropped.
     num_updates: Array  # [] int32
     num_skipped: Array  # [] int32, updates dropped because the loss was not finite
 
@@ -167,13 +169,13 @@ def fit(
                     used / jnp.maximum(count, 1.0), has_rows,
                     (number + i / jnp.maximum(num_batches, 1)) / config.num_epochs,
                 )  # fmt: skip
-                bad = jnp.logical_not(jnp.isfinite(loss)) & has_rows
-                counts = has_rows & jnp.logical_not(bad)
+                good = has_rows & jnp.isfinite(loss)
                 totals = jax.tree.map(
-                    lambda t, x: t + jnp.where(counts, count * x, 0.0),
+                    lambda t, x: t + jnp.where(good, count * x, 0.0),
                     totals, (loss, mse, jnp.ones_like(loss)),
                 )  # fmt: skip
-                return network, opt_state, skipped + bad.astype(jnp.int32), totals
+                skipped += (has_rows & jnp.logical_not(good)).astype(jnp.int32)
+                return network, opt_state, skipped, totals
 
             def batches(i: Array, carry: tuple) -> tuple:
                 def one(j: Array, carry: tuple) -> tuple:
@@ -182,18 +184,12 @@ def fit(
                 # Its length is known. The last ones may find no rows left.
                 return jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, carry)
 
-            zero = jnp.zeros((), jnp.float32)
-            carry = (network, opt_state, skipped, (zero, zero, zero))
+            carry = (network, opt_state, skipped, (jnp.zeros((), jnp.float32),) * 3)
             num_turns = (num_batches + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
             return jax.lax.fori_loop(0, num_turns, batches, carry), None
 
-        zero = jnp.zeros((), jnp.float32)
-        carry = (
-            params.network,
-            state.opt_state,
-            jnp.zeros((), jnp.int32),
-            (zero, zero, zero),
-        )
+        totals = (jnp.zeros((), jnp.float32),) * 3
+        carry = (params.network, state.opt_state, jnp.zeros((), jnp.int32), totals)
         keys = jax.random.split(epochs_key, config.num_epochs)
         epochs = (jnp.arange(config.num_epochs, dtype=jnp.float32), keys)
         (network, opt_state, skipped, totals), _ = jax.lax.scan(epoch, carry, epochs)

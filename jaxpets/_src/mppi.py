@@ -12,6 +12,7 @@ from jaxpets._src.checks import (
     check_count,
     check_real,
 )
+from jaxpets._src.elites import not_rejected
 from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
 
 
@@ -79,7 +80,7 @@ def mppi(
             check_array("objective_fn's result", values, [num_samples])
             # Ranks, not values, set the scale where one candidate has blown up.
             # The rejected neither set the scale nor have a weight, unless all are.
-            kept = (values > WORST_VALUE) | jnp.all(values <= WORST_VALUE)
+            kept = not_rejected(values, WORST_VALUE)
             quartiles = jnp.array([0.25, 0.75], jnp.float32)
             low, high = jnp.nanquantile(jnp.where(kept, values, jnp.nan), quartiles)
             spread = jnp.maximum(high - low, 1e-6)
