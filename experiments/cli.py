@@ -144,17 +144,19 @@ def differences(
 ) -> list[str]:  # fmt: skip
     """Returns what differs between two configs in JSON, as `field: old vs new`.
 
-    A version that did not know an entry did what its default, in JSON, stands for. It
-    cannot differ in an entry that only `old` has, or in a group of them it lacks.
+    An entry that `old` lacks, because an older version wrote it, stands for that of
+    `default`, a config in JSON. A group of entries that it lacks, or an entry that
+    `new` lacks, cannot differ.
     """
     lines = []
     for name in sorted({*new} - set(ignore)):
         now = new[name]
-        if isinstance(now, dict):
-            before = old.get(name, now)
+        unsaid = now if isinstance(now, dict) else default.get(name, now)
+        before = old.get(name, unsaid)
+        if isinstance(before, dict) and isinstance(now, dict):
             groups = differences(before, now, (), default.get(name, {}))
             lines += [f"{name}.{line}" for line in groups]
-        elif (before := old.get(name, default.get(name, now))) != now:
+        elif before != now:
             lines.append(f"{name}: {before} (there) vs {now} (now)")
     return lines
 

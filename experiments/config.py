@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -15,6 +15,7 @@ ArmName = Literal[
 ]
 EngineName = Literal["mjx", "mujoco"]
 TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
+NUM_TASKS = len(get_args(TaskName)) - 1  # of "all"
 
 
 def number(default: Any, low: float, high: float) -> Any:

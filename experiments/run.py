@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from experiments import cli, hosts, session
-from experiments.config import Config, PlannerNumbers
+from experiments.config import NUM_TASKS, Config, PlannerNumbers
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -134,24 +134,13 @@ def _check_cpu(config: Config) -> None:
 
     if jax.default_backend() != "cpu" or config.allow_cpu:
         return
-    trials = {
-        "explore": config.num_trials - config.random_trials,
-        "zero-shot": config.eval_trials,
-        "finetune": config.finetune_trials,
-    }[config.phase]
-    length = config.task_length
-    if config.phase == "explore":
-        length = config.trial_length
-        trials *= config.arm != "random"  # which plans nothing
     _, planner = _search(config)
     model = config.model
     width = model.hidden_size
     products = 24 * width + (model.num_layers - 1) * width**2 + width * 36
     rows = planner.num_samples * planner.num_particles * planner.num_iterations
-    steps = _num_tasks(config) * trials * length
-    hours = (
-        2 * products * rows * planner.horizon * steps * len(config.seeds) / 1e11 / 3600
-    )
+    steps = _planned_steps(config) * len(config.seeds)
+    hours = 2 * products * rows * planner.horizon * steps / 1e11 / 3600
     if hours > 1:
         raise UsageError(
             f"--phase {config.phase} of --preset {config.preset} would take about "
@@ -214,7 +203,17 @@ def _search(config: Config) -> tuple[str, PlannerNumbers]:
 
 def _num_tasks(config: Config) -> int:
     """Returns how many tasks are planned for at once; exploration is one."""
-    return 4 if config.phase != "explore" and config.task == "all" else 1
+    return NUM_TASKS if config.phase != "explore" and config.task == "all" else 1
+
+
+def _planned_steps(config: Config) -> int:
+    """Returns how many steps of environments a seed plans for in a phase."""
+    if config.phase == "explore":
+        planned = config.num_trials - config.random_trials
+        return planned * config.trial_length if config.arm != "random" else 0
+    zero_shot = config.phase == "zero-shot"
+    trials = config.eval_trials if zero_shot else config.finetune_trials
+    return _num_tasks(config) * trials * config.task_length
 
 
 def _say(text: str) -> None:

@@ -5,6 +5,7 @@ resumed run cuts the log back to there, so that each trial is in it once.
 """
 
 import contextlib
+import datetime
 import fcntl
 import json
 import math
@@ -31,6 +32,7 @@ __all__ = [
     "environment",
     "lock",
     "log_size",
+    "now",
     "probe",
     "read_json",
     "write_json",
@@ -38,6 +40,11 @@ __all__ = [
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _MAX_JSON_BYTES = 1_000_000
+
+
+def now() -> str:
+    """Returns the time in UTC, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def check_name(name: str) -> None:

@@ -1,18 +1,17 @@
 """A run's folder for as long as the run lasts: locked, described, and accounted for."""
 
 import contextlib
-import datetime
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments import cli, rundir
+from experiments.config import NUM_TASKS
 from experiments.errors import CheckpointError, InterruptedRun, RunError
 from experiments.presets import PRESETS
 
 # Two checkpoints and one being written, of a paper-sized run of one seed and task.
 _NEEDED_BYTES = 64 * 2**20
-_NUM_TASKS = 4
 
 
 @contextlib.contextmanager
@@ -37,7 +36,7 @@ def open_run(
     """
     branches = len(config["seeds"])
     if (config["phase"], config["task"]) == ("finetune", "all"):
-        branches *= _NUM_TASKS
+        branches *= NUM_TASKS
     rundir.probe(folder, _NEEDED_BYTES * branches)
     with rundir.lock(folder):
         _compare(folder / "config.json", config, ignore)
@@ -65,7 +64,7 @@ def open_run(
 
 def _compare(path: Path, config: dict[str, Any], ignore: Sequence[str]) -> None:
     if path.exists():
-        default = cli.to_json(PRESETS["paper"])  # the field's own, in every preset
+        default = cli.to_json(PRESETS["paper"])  # Config's own defaults
         lines = cli.differences(rundir.read_json(path), config, ignore, default)
         if lines:
             another = "--name" if config["phase"] == "explore" else "--tag"
@@ -78,6 +77,5 @@ def _compare(path: Path, config: dict[str, Any], ignore: Sequence[str]) -> None:
 
 
 def _status(folder: Path, state: str, reason: str = "") -> None:
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    status = {"state": state, "reason": reason, "time": now}
+    status = {"state": state, "reason": reason, "time": rundir.now()}
     rundir.write_json(folder / "status.json", status)

@@ -6,7 +6,6 @@ is limited by the model.
 """
 
 import dataclasses
-import datetime
 import sys
 import time
 from collections.abc import Sequence
@@ -73,8 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Performs, and prints a line per task."""
     args = tyro.cli(Arguments, args=argv, prog="experiments.simulator")
     begin = time.monotonic()
-    date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    where = {"date": date, "env": rundir.environment()}
+    where = {"date": rundir.now(), "env": rundir.environment()}
     returns = perform(args)
     for name, own in zip(half_cheetah.TASK_NAMES, returns, strict=True):
         each = " ".join(f"{value:.0f}" for value in own)
