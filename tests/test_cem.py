@@ -173,12 +173,12 @@ def test_few_left_of_many_rejected_make_the_plan():
     """Fewer than num_elites are left: the plan is their mean, not that of the rest."""
 
     def value(actions):
-        return jnp.where(actions[:, 0, 0] < 0.9, jaxpets.WORST_VALUE, 1.0)
+        return jnp.where(actions[:, 0, 0] < 0.75, jaxpets.WORST_VALUE, 1.0)
 
     found = record(search(num_samples=60, num_iterations=1, momentum=0.0), value)
     assert 0 < (found.values[0] > 0).sum() < 6
     assert found.solution.value == 1.0
-    assert found.solution.actions[0, 0] >= 0.9
+    assert found.solution.actions[0, 0] >= 0.75
 
 
 @pytest.mark.parametrize(

@@ -100,9 +100,9 @@ def cem(
     ) -> tuple[Solution, CEMState]:
         check_array("state.mean", state.mean, shape)
 
-        def iterate(carry: tuple, key: Array) -> tuple[tuple, None]:
+        def iterate(carry: tuple, keys: Array) -> tuple[tuple, None]:
             mean, variance, _value = carry
-            sample_key, value_key = jax.random.split(key)
+            sample_key, value_key = keys
             actions = sample(sample_key, mean, variance)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [num_samples])
@@ -124,7 +124,7 @@ def cem(
 
         variance = jnp.broadcast_to(half_width**2 / 4, shape)
         start = (state.mean, variance, jnp.zeros((), jnp.float32))
-        keys = jax.random.split(key, num_iterations)
+        keys = jax.random.split(key, (num_iterations, 2))
         (mean, _, value), _ = jax.lax.scan(iterate, start, keys)
         shifted = jnp.concatenate([mean[1:], center[None]])
         return Solution(actions=mean, value=value), CEMState(mean=shifted)

@@ -100,11 +100,11 @@ def icem(
         check_array("state.mean", mean, shape)
         check_array("state.elites", kept, [num_kept, *shape])
         std = jnp.broadcast_to(init_std * half_width, shape)
-        keys = jax.random.split(key, num_iterations)
+        keys = jax.random.split(key, (num_iterations, 2))
         best = value = None
         # A Python loop, because the population, a shape, shrinks.
         for i, population in enumerate(populations):
-            sample_key, value_key = jax.random.split(keys[i])
+            sample_key, value_key = keys[i]
             noise = colored_noise(sample_key, noise_beta, (population, *shape))
             actions = jnp.clip(mean + std * noise, action_low, action_high)
             candidates = [actions, kept]

@@ -72,8 +72,8 @@ def mppi(
     ) -> tuple[Solution, MPPIState]:
         check_array("state.mean", state.mean, shape)
 
-        def iterate(mean: Array, key: Array) -> tuple[Array, Array]:
-            sample_key, value_key = jax.random.split(key)
+        def iterate(mean: Array, keys: Array) -> tuple[Array, Array]:
+            sample_key, value_key = keys
             noise = jax.random.normal(sample_key, (num_samples, *shape), jnp.float32)
             actions = jnp.clip(mean + scale * noise, action_low, action_high)
             values = objective_fn(value_key, actions)
@@ -90,7 +90,7 @@ def mppi(
             mean = jnp.einsum("n,nha->ha", weights, actions)
             return jnp.clip(mean, action_low, action_high), jnp.sum(weights * values)
 
-        keys = jax.random.split(key, num_iterations)
+        keys = jax.random.split(key, (num_iterations, 2))
         mean, values = jax.lax.scan(iterate, state.mean, keys)
         shifted = jnp.concatenate([mean[1:], center[None]])
         return Solution(actions=mean, value=values[-1]), MPPIState(mean=shifted)

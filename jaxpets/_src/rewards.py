@@ -1,5 +1,6 @@
 """Rewards that seek, or shun, what the ensemble does not know."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -129,7 +130,12 @@ def _variance_of_means(baseline_variance: Array, next_obs: Array) -> Array:
     check_array("next_obs", next_obs, ["E", "P", "D"])
     check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
     _check_members(next_obs.shape[0])
-    return jnp.var(jnp.mean(next_obs, axis=1), axis=0)
+    # Written out member by member, so that XLA reads the path once: of jnp.var it makes
+    # three programs on a GPU, of which one writes the means and one reads them again.
+    means = [jnp.mean(member, axis=0) for member in next_obs]
+    center = functools.reduce(jnp.add, means) / len(means)
+    squares = [(mean - center) ** 2 for mean in means]
+    return functools.reduce(jnp.add, squares) / len(means)
 
 
 def _check_members(num_members: int) -> None:
