@@ -67,7 +67,7 @@ def candidates(
 ) -> dict[str, Any]:
     """Compares one plan over `count` devices with the plan on one."""
     rollout = workloads.rollout_fn(size, args.precision, args.engine)
-    search = workloads.optimizer(size, "cem")
+    search = workloads.optimizer(size, "cem", args.engine)
     whole = jaxpets.plan(rollout, jaxpets.rewards.epistemic, search)
     parted = jaxpets.plan(
         rollout, jaxpets.rewards.epistemic, jaxpets.sharded(search, AXIS)

@@ -130,10 +130,13 @@ def rollout_work(
     return rollout_fn(size, precision, engine), (start, key, obs, actions)
 
 
-def optimizer(size: Size, name: str) -> jaxpets.TrajectoryOptimizer:
-    """Returns `cem` or `icem` at this size."""
+def optimizer(
+    size: Size, name: str, engine: str = "scan"
+) -> jaxpets.TrajectoryOptimizer:
+    """Returns `cem` or `icem` at this size, as the experiment has it for the engine."""
     one = jnp.ones((half_cheetah.ACTION_SIZE,), jnp.float32)
-    build = {"cem": jaxpets.cem, "icem": jaxpets.icem}[name]
+    cem = functools.partial(jaxpets.cem, unroll=engine == "kernel")
+    build = {"cem": cem, "icem": jaxpets.icem}[name]
     return build(
         horizon=size.horizon,
         action_low=-one,
@@ -160,7 +163,7 @@ def planner(
     return jaxpets.plan(
         rollout_fn(size, precision, engine),
         rewards[reward],
-        optimizer(size, search),
+        optimizer(size, search, engine),
         chunk_size=chunk_size,
     )
 

@@ -142,8 +142,7 @@ def _ensemble(
 
 def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.RolloutFn:
     precision = jaxpets.Precision(search.precision)
-    is_bf16 = precision is jaxpets.Precision.BF16
-    if search.fused and is_bf16 and jax.default_backend() == "gpu":
+    if _wants_kernel(search):
         return jaxpets.fused_rollout(
             dataclasses.replace(size, precision=precision),
             half_cheetah.model_space(),
@@ -156,6 +155,11 @@ def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.Ro
         num_members=size.num_members,
         num_particles=search.num_particles,
     )
+
+
+def _wants_kernel(search: PlannerNumbers) -> bool:
+    is_bf16 = jaxpets.Precision(search.precision) is jaxpets.Precision.BF16
+    return search.fused and is_bf16 and jax.default_backend() == "gpu"
 
 
 def _weight_decays(num_layers: int) -> tuple[float, ...]:
@@ -179,4 +183,6 @@ def optimizer(numbers: PlannerNumbers, env: jaxpets.Env) -> jaxpets.TrajectoryOp
     size |= {"num_elites": numbers.num_elites, "momentum": numbers.momentum}
     if numbers.optimizer == "icem":
         return jaxpets.icem(**size, noise_beta=numbers.noise_beta)
-    return jaxpets.cem(**size, legacy_variance=numbers.legacy_variance)
+    return jaxpets.cem(
+        **size, legacy_variance=numbers.legacy_variance, unroll=_wants_kernel(numbers)
+    )

@@ -1,3 +1,5 @@
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +64,33 @@ def test_search_equals_the_reference_on_its_samples(box, legacy):
     np.testing.assert_allclose(found.solution.value, last.mean(), rtol=1e-5)
     fill = (low + high) / 2
     np.testing.assert_allclose(found.state.mean, reference.shift(mean, fill), atol=1e-5)
+
+
+@pytest.mark.parametrize("num_iterations", [1, 4])
+def test_unrolled_search_is_the_loop(num_iterations):
+    """The same samples, elites and plan, to the rounding of other programs."""
+    loop = record(search(num_iterations=num_iterations), bumpy)
+    written_out = record(search(num_iterations=num_iterations, unroll=True), bumpy)
+    assert len(written_out.actions) == num_iterations
+    for name in ("actions", "values"):
+        pair = getattr(written_out, name), getattr(loop, name)
+        np.testing.assert_allclose(*pair, atol=1e-6)
+    pair = written_out.solution.actions, loop.solution.actions
+    np.testing.assert_allclose(*pair, atol=1e-6)
+
+
+def test_unroll_compiles_every_iteration():
+    def num_selections(unroll):
+        optimizer = search(num_iterations=3, unroll=unroll)
+
+        @jax.jit
+        def step(key):
+            return optimizer.step(quadratic(ONE), key, optimizer.init())
+
+        text = step.lower(jax.random.key(0)).compile().as_text()
+        return len(re.findall(r"top_k\b|sort\(|TopK", text))
+
+    assert num_selections(unroll=True) == 3 * num_selections(unroll=False) > 0
 
 
 def test_legacy_variance_narrows_faster():
@@ -203,3 +232,5 @@ def test_bad_settings_fail_when_built(changes, text):
 def test_bad_types_fail_when_built():
     with pytest.raises(TypeError, match="num_samples must be a Python int"):
         search(num_samples=40.0)
+    with pytest.raises(TypeError, match="unroll must be True or False, got"):
+        search(unroll=2)

@@ -34,6 +34,7 @@ def cem(
     momentum: float = 0.1,
     min_variance: float = 1e-3,
     legacy_variance: bool = False,
+    unroll: bool = False,
 ) -> TrajectoryOptimizer:
     """Builds the cross-entropy method with the settings of PETS.
 
@@ -56,6 +57,9 @@ def cem(
         box scaled to `[-1, 1]`.
       legacy_variance: take the elites' variance without momentum, as the first
         public PETS code did by mistake until November 2018.
+      unroll: compile the iterations one after the other and not as a loop. The search
+        is the same. With `fused_rollout`, where a loop's own programs count, a plan is
+        up to 2 % faster, and its code num_iterations times as long.
 
     Returns:
       A TrajectoryOptimizer.
@@ -79,6 +83,7 @@ def cem(
     check_real("momentum", momentum, 0.0, 1.0)
     check_real("min_variance", min_variance, 0.0)
     check_flag("legacy_variance", legacy_variance)
+    check_flag("unroll", unroll)
     center = (action_low + action_high) / 2
     half_width = (action_high - action_low) / 2
     shape = (horizon, center.shape[0])
@@ -125,7 +130,7 @@ def cem(
         variance = jnp.broadcast_to(half_width**2 / 4, shape)
         start = (state.mean, variance, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
-        (mean, _, value), _ = jax.lax.scan(iterate, start, keys)
+        (mean, _, value), _ = jax.lax.scan(iterate, start, keys, unroll=unroll)
         shifted = jnp.concatenate([mean[1:], center[None]])
         return Solution(actions=mean, value=value), CEMState(mean=shifted)
 

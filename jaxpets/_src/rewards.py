@@ -35,7 +35,7 @@ def epistemic(
     """
     del obs, action
     variance = _variance_of_means(baseline_variance, next_obs)
-    return jnp.mean(jnp.sqrt(variance / baseline_variance))
+    return _mean(jnp.sqrt(variance / baseline_variance))
 
 
 def information_gain(
@@ -56,7 +56,7 @@ def information_gain(
     """
     del obs, action
     variance = _variance_of_means(baseline_variance, next_obs)
-    return jnp.mean(jnp.log1p(variance / baseline_variance)) / 2
+    return _mean(jnp.log1p(variance / baseline_variance) / 2)
 
 
 def one_step_disagreement(
@@ -136,6 +136,11 @@ def _variance_of_means(baseline_variance: Array, next_obs: Array) -> Array:
     center = functools.reduce(jnp.add, means) / len(means)
     squares = [(mean - center) ** 2 for mean in means]
     return functools.reduce(jnp.add, squares) / len(means)
+
+
+def _mean(x: Array) -> Array:
+    # Divided before it is summed: XLA then makes one sum of this and that over time.
+    return jnp.sum(x / x.size)
 
 
 def _check_members(num_members: int) -> None:
