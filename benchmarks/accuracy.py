@@ -1,0 +1,168 @@
+"""How far a rollout that rounds more is from the scan in float32, on an explored model.
+
+The candidates of CEM's first iteration are imagined from states of trials that the
+model performed, with the same noise. `error` is the norm of the difference over that of
+the paths; `overlap` is the share of a reward's best candidates that are also its best
+in float32. Of both, the mean and the worst over states. `moved` is the scan in float32
+itself, from a start 1e-5 standard deviations of the states away: a cheetah is chaotic,
+and no rounding can be expected to stay nearer than that.
+
+    python -m experiments.run --phase zero-shot --from pretrained
+    python -m benchmarks.accuracy runs/pretrained-epistemic/zero-shot-060
+"""
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import jaxpets
+from benchmarks import rows, workloads
+from experiments import checkpoint, cli, phases, rundir
+from experiments.build import build
+from experiments.presets import PRESETS
+from jaxpets.envs import half_cheetah
+
+COLUMNS = (
+    "rollout", "reward", "error", "most_error", "overlap", "least_overlap",
+)  # fmt: skip
+ROLLOUTS = ("moved", "tf32", "bf16", "kernel")
+_DISTANCE = 1e-5
+
+# (key, obs [D], actions [N, H, A]) -> path [N, H + 1, E, P, D] and values by reward.
+Imagine = Callable[[Array, Array, Array], tuple[Array, dict[str, Array]]]
+
+
+def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yields a row for every rollout and reward."""
+    params, size = explored(args.run, workloads.chosen_size(args))
+    starts, scale = states(args.run / "trajectories.npz", args.states)
+    exact = imagine(params, size, "f32")
+    for name in args.rollout:
+        other = exact if name == "moved" else imagine(params, size, name)
+        distance = _DISTANCE * scale if name == "moved" else jnp.zeros_like(scale)
+        error, overlap = compare(exact, other, starts, distance, size)
+        for reward, shares in overlap.items():
+            yield rows.make_row(
+                "accuracy",
+                {**dataclasses.asdict(size), "run": str(args.run)},
+                rollout=name,
+                reward=reward,
+                states=len(starts),
+                error=float(np.mean(error)),
+                most_error=max(error),
+                overlap=float(np.mean(shares)),
+                least_overlap=min(shares),
+            )
+
+
+def compare(
+    exact: Imagine, other: Imagine, starts: Array, distance: Array, size: workloads.Size
+) -> tuple[list[float], dict[str, list[float]]]:
+    """Returns the error, and the overlap by reward, at every one of starts `[B, D]`.
+
+    There `other` starts about distance `[D]` from where `exact` does.
+    """
+    error: list[float] = []
+    overlap: dict[str, list[float]] = {}
+    shape = (size.num_samples, size.horizon, half_cheetah.ACTION_SIZE)
+    for i, obs in enumerate(starts):
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(0), i), 3)
+        # CEM starts with half the box's half width as deviation, cut off at two.
+        actions = jax.random.truncated_normal(keys[0], -2.0, 2.0, shape) / 2
+        path, values = exact(keys[1], obs, actions)
+        away = distance * jax.random.normal(keys[2], obs.shape)
+        near, found = other(keys[1], obs + away, actions)
+        error.append(float(jnp.linalg.norm(near - path) / jnp.linalg.norm(path)))
+        for reward in values:
+            best, same = (
+                jax.lax.top_k(x[reward], size.num_elites)[1] for x in (values, found)
+            )
+            share = np.intersect1d(best, same).size / size.num_elites
+            overlap.setdefault(reward, []).append(share)
+    return error, overlap
+
+
+def explored(
+    folder: Path, search: workloads.Size
+) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
+    """Returns the first model of a folder of zero-shots, and a search of its size."""
+    config = cli.from_json(rundir.read_json(folder / "config.json"), PRESETS["smoke"])
+    if config.model.state_margin != jaxpets.EnsembleConfig().state_margin:
+        raise SystemExit(f"{folder} has its own --model.state-margin")
+    template = phases.model_of(phases.explored_template(config, build(config)))
+    found = checkpoint.restore(folder / "checkpoints", template, warn=print)
+    if found is None:
+        raise SystemExit(f"there is no checkpoint in {folder}")
+    params = jax.tree.map(lambda x: x[0], found[1].params)
+    size = dataclasses.replace(
+        search,
+        num_members=config.model.num_members,
+        hidden_sizes=(config.model.hidden_size,) * config.model.num_layers,
+    )
+    return params, size
+
+
+def states(npz: Path, count: int) -> tuple[Array, Array]:
+    """Returns states of the first seed's trials `[B, D]`, of all tasks in turn.
+
+    Also the standard deviation `[D]` of all states of that seed.
+    """
+    with np.load(npz, allow_pickle=False) as file:
+        obs = file["obs"][0, :, 0]  # [K, T, D]
+    num_tasks, length, _ = obs.shape
+    times = np.arange(1, count + 1) * length // (count + 1)
+    starts = obs[np.arange(count) % num_tasks, times]
+    return jnp.asarray(starts), jnp.asarray(obs.std((0, 1)))
+
+
+def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> Imagine:
+    """Returns the compiled rollout, with the values of what it imagines."""
+    engine, precision = ("kernel", "bf16") if name == "kernel" else ("scan", name)
+    rollout = workloads.rollout_fn(size, precision, engine)
+    rewards: dict[str, tuple[Any, Any]] = {
+        "epistemic": (jaxpets.rewards.epistemic, jaxpets.max_variance(params)),
+    } | {
+        task: (half_cheetah.task_reward, half_cheetah.task(task))
+        for task in half_cheetah.TASK_NAMES
+    }
+
+    def value(name: str, path: Array, actions: Array) -> Array:
+        reward_fn, weights = rewards[name]
+
+        def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+            return jnp.mean(reward_fn(weights, obs, action, next_obs))
+
+        steps = (path[:, :-1], actions, path[:, 1:])
+        return jax.vmap(jax.vmap(reward))(*steps).sum(1)
+
+    def run(
+        params: jaxpets.EnsembleParams, key: Array, obs: Array, actions: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        path = rollout(params, key, obs, actions)
+        return path, {name: value(name, path, actions) for name in rewards}
+
+    return functools.partial(jax.jit(run), params)
+
+
+def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Parses the arguments, measures and reports."""
+    parser = rows.parser(__doc__)
+    parser.add_argument("run", type=Path, help="folder of a run's zero-shots")
+    workloads.add_size_flag(parser)
+    parser.add_argument("--rollout", nargs="+", choices=ROLLOUTS,
+                        default=["moved", "bf16"], help="what to compare")  # fmt: skip
+    parser.add_argument("--states", type=rows.positive, default=8, help="to start from")
+    args = parser.parse_args(argv)
+    return rows.report(run(args), COLUMNS, args.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""The accuracy of a rollout: what is compared, and the program on a performed run."""
+
+import argparse
+import dataclasses
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import accuracy, workloads
+from experiments import checkpoint, cli, phases, rundir
+from experiments.build import build
+from experiments.presets import PRESETS
+from jaxpets.envs import half_cheetah
+
+SIZE = dataclasses.replace(workloads.named_size("tiny"), num_samples=10, num_elites=4)
+REWARDS = {"epistemic", *half_cheetah.TASK_NAMES}
+
+
+def imagines(scale, values):
+    """An Imagine whose path is the start times scale."""
+
+    def imagine(key, obs, actions):
+        del key
+        assert actions.shape == (10, 3, half_cheetah.ACTION_SIZE)
+        assert jnp.max(jnp.abs(actions)) <= 1.0
+        return scale * obs, {"reward": jnp.asarray(values, jnp.float32)}
+
+    return imagine
+
+
+def test_error_and_overlap_are_those_of_the_paths_and_of_the_best():
+    exact = imagines(1.0, np.arange(10))  # the best are 6, 7, 8, 9
+    other = imagines(1.5, [0, 0, 0, 0, 9, 9, 9, 9, 0, 0])  # 4, 5, 6, 7
+    starts = jnp.ones((2, half_cheetah.OBS_SIZE))
+    error, overlap = accuracy.compare(exact, other, starts, jnp.zeros(18), SIZE)
+    np.testing.assert_allclose(error, [0.5, 0.5], rtol=1e-6)
+    assert overlap == {"reward": [0.5, 0.5]}
+
+
+def test_a_moved_start_moves_by_its_distance():
+    exact = imagines(1.0, np.arange(10))
+    starts = jnp.ones((30, half_cheetah.OBS_SIZE))
+    error, overlap = accuracy.compare(exact, exact, starts, jnp.full(18, 1e-2), SIZE)
+    assert overlap == {"reward": [1.0] * 30}
+    # The root mean square of 540 normal draws, 4 sigma.
+    assert abs(np.sqrt(np.mean(np.square(error))) - 1e-2) < 2e-3
+
+
+@pytest.fixture(scope="module")
+def performed(tmp_path_factory):
+    """What a zero-shot leaves behind: config, model and trajectories."""
+    folder = tmp_path_factory.mktemp("zero-shot-060")
+    smoke = PRESETS["smoke"]
+    search = dataclasses.replace(smoke.planner, num_particles=5)
+    config = dataclasses.replace(
+        smoke,
+        phase="zero-shot",
+        seeds=(0, 1),
+        model=dataclasses.replace(smoke.model, num_members=5),
+        planner=search,
+        task_planner=search,
+    )
+    rundir.write_json(folder / "config.json", cli.to_json(config))
+    keys = jax.random.split(jax.random.key(0), 2)
+    size = dataclasses.replace(SIZE, hidden_sizes=(16, 16))
+    params = jax.jit(jax.vmap(functools.partial(workloads.params, size)))(keys)
+    model = phases.model_of(phases.explored_template(config, build(config)))
+    model = model._replace(params=params)
+    checkpoint.save(folder / "checkpoints", 60, model, {}, finite=model)
+    obs = np.random.default_rng(0).normal(size=(2, 4, 1, 50, half_cheetah.OBS_SIZE))
+    np.savez(folder / "trajectories.npz", obs=obs.astype(np.float32))
+    return folder
+
+
+def test_states_are_of_the_first_seed_and_all_tasks(performed):
+    starts, scale = accuracy.states(performed / "trajectories.npz", 4)
+    with np.load(performed / "trajectories.npz") as file:
+        obs = file["obs"]
+    assert starts.shape == (4, half_cheetah.OBS_SIZE)
+    for task, start in enumerate(starts):
+        assert any(np.array_equal(start, state) for state in obs[0, task, 0])
+    np.testing.assert_allclose(scale, obs[0].std((0, 1, 2)), rtol=1e-5)
+
+
+def test_program_compares_an_explored_model(performed, tmp_path):
+    """On a CPU tf32 is float32; bfloat16 is further off than a moved start."""
+    path = tmp_path / "rows.jsonl"
+    flags = ["--tiny", "--states", "2", "--rollout", "moved", "tf32", "bf16"]
+    found = accuracy.main([str(performed), *flags, "--json", str(path)])
+    written = [json.loads(line) for line in path.read_text().splitlines()]
+    assert json.loads(json.dumps(found)) == written
+    assert {row["reward"] for row in found} == REWARDS
+    error = {row["rollout"]: row["error"] for row in found}
+    assert error["tf32"] == 0 < error["moved"] < error["bf16"] < 0.1
+    for row in found:
+        assert row["states"] == 2 and row["error"] <= row["most_error"]
+        assert 0 <= row["least_overlap"] <= row["overlap"] <= 1
+        assert row["rollout"] != "tf32" or row["least_overlap"] == 1
+
+
+def test_a_folder_without_a_model_is_refused(performed, tmp_path):
+    (tmp_path / "config.json").write_text((performed / "config.json").read_text())
+    with pytest.raises(SystemExit, match="there is no checkpoint in"):
+        accuracy.explored(tmp_path, SIZE)
+
+
+def test_another_margin_is_refused(performed, tmp_path):
+    config = json.loads((performed / "config.json").read_text())
+    config["model"]["state_margin"] = None
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(SystemExit, match="has its own --model"):
+        accuracy.explored(tmp_path, SIZE)
+
+
+def test_no_kernel_is_timed_where_none_runs(performed):
+    if jax.default_backend() == "gpu":
+        pytest.skip("there may be a kernel")
+    args = argparse.Namespace(
+        run=performed, states=1, rollout=["kernel"], tiny=True, size="paper"
+    )
+    with pytest.raises(SystemExit, match="no kernel to time"):
+        next(accuracy.run(args))
