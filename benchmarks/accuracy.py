@@ -27,6 +27,7 @@ import jaxpets
 from benchmarks import rows, workloads
 from experiments import checkpoint, cli, phases, rundir
 from experiments.build import build
+from experiments.errors import RunError
 from experiments.presets import PRESETS
 from jaxpets.envs import half_cheetah
 
@@ -42,8 +43,8 @@ Imagine = Callable[[Array, Array, Array], tuple[Array, dict[str, Array]]]
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every rollout and reward."""
-    params, size = explored(args.run, workloads.chosen_size(args))
     starts, scale = states(args.run / "trajectories.npz", args.states)
+    params, size = explored(args.run, workloads.chosen_size(args))
     exact = imagine(params, size, "f32")
     for name in args.rollout:
         other = exact if name == "moved" else imagine(params, size, name)
@@ -56,8 +57,8 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 rollout=name,
                 reward=reward,
                 states=len(starts),
-                error=float(np.mean(error)),
-                most_error=max(error),
+                error=_number(np.mean(error)),
+                most_error=_number(np.max(error)),
                 overlap=float(np.mean(shares)),
                 least_overlap=min(shares),
             )
@@ -93,8 +94,27 @@ def compare(
 def explored(
     folder: Path, search: workloads.Size
 ) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
-    """Returns the first model of a folder of zero-shots, and a search of its size."""
+    """Returns the first model of a folder of zero-shots, and the search with it.
+
+    Raises:
+      SystemExit: if there is none that can be compared.
+    """
+    try:
+        return _explored(folder, search)
+    except RunError as error:
+        raise SystemExit(f"cannot read {folder}: {error}") from error
+
+
+def _explored(
+    folder: Path, search: workloads.Size
+) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
     config = cli.from_json(rundir.read_json(folder / "config.json"), PRESETS["smoke"])
+    num_members = config.model.num_members
+    if num_members < 2 or search.num_particles % num_members:
+        raise SystemExit(
+            f"{folder} has {num_members} members; they must be 2 or more and divide "
+            f"the {search.num_particles} particles of the search"
+        )
     if config.model.state_margin != jaxpets.EnsembleConfig().state_margin:
         raise SystemExit(f"{folder} has its own --model.state-margin")
     template = phases.model_of(phases.explored_template(config, build(config)))
@@ -104,23 +124,30 @@ def explored(
     params = jax.tree.map(lambda x: x[0], found[1].params)
     size = dataclasses.replace(
         search,
-        num_members=config.model.num_members,
+        num_members=num_members,
         hidden_sizes=(config.model.hidden_size,) * config.model.num_layers,
     )
     return params, size
 
 
 def states(npz: Path, count: int) -> tuple[Array, Array]:
-    """Returns states of the first seed's trials `[B, D]`, of all tasks in turn.
+    """Returns states of the first seed's first trials `[B, D]`, of all tasks in turn.
 
     Also the standard deviation `[D]` of all states of that seed.
+
+    Raises:
+      SystemExit: if there is no such file or its trials are too short.
     """
+    if not npz.exists():
+        raise SystemExit(f"there is no {npz}")
     with np.load(npz, allow_pickle=False) as file:
-        obs = file["obs"][0, :, 0]  # [K, T, D]
-    num_tasks, length, _ = obs.shape
+        obs = file["obs"][0]  # [K, R, T, D]
+    num_tasks, _, length, _ = obs.shape
+    if length <= count:
+        raise SystemExit(f"--states {count}: the trials have {length} steps")
     times = np.arange(1, count + 1) * length // (count + 1)
-    starts = obs[np.arange(count) % num_tasks, times]
-    return jnp.asarray(starts), jnp.asarray(obs.std((0, 1)))
+    starts = obs[np.arange(count) % num_tasks, 0, times]
+    return jnp.asarray(starts), jnp.asarray(obs.std((0, 1, 2)))
 
 
 def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> Imagine:
@@ -134,22 +161,25 @@ def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> 
         for task in half_cheetah.TASK_NAMES
     }
 
-    def value(name: str, path: Array, actions: Array) -> Array:
-        reward_fn, weights = rewards[name]
-
-        def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    def value(
+        reward_fn: jaxpets.RewardFn, weights: Any, path: Array, actions: Array
+    ) -> Array:
+        def one(obs: Array, action: Array, next_obs: Array) -> Array:
             return jnp.mean(reward_fn(weights, obs, action, next_obs))
 
         steps = (path[:, :-1], actions, path[:, 1:])
-        return jax.vmap(jax.vmap(reward))(*steps).sum(1)
+        total = jax.vmap(jax.vmap(one))(*steps).sum(1)
+        return jnp.where(jnp.isfinite(total), total, jaxpets.WORST_VALUE)
 
-    def run(
+    def imagined(
         params: jaxpets.EnsembleParams, key: Array, obs: Array, actions: Array
     ) -> tuple[Array, dict[str, Array]]:
         path = rollout(params, key, obs, actions)
-        return path, {name: value(name, path, actions) for name in rewards}
+        return path, {
+            reward: value(*parts, path, actions) for reward, parts in rewards.items()
+        }
 
-    return functools.partial(jax.jit(run), params)
+    return functools.partial(jax.jit(imagined), params)
 
 
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
@@ -162,6 +192,10 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--states", type=rows.positive, default=8, help="to start from")
     args = parser.parse_args(argv)
     return rows.report(run(args), COLUMNS, args.json)
+
+
+def _number(x: np.floating) -> float | None:
+    return float(x) if np.isfinite(x) else None  # JSON has no NaN
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from benchmarks import env, fit, plan, rollout, rows, trace
 
 SET = (
     (plan, "--precision bf16 tf32 --seeds 1 4 16"),
-    (plan, "--precision f32 --seeds 1"),
+    (plan, "--precision f32 --seeds 1 4 16"),
     (fit, "--seeds 1 4 16"),
     (rollout, "--precision bf16 tf32 f32"),
     (env, "--batch 1 4 16 64 256 4096"),

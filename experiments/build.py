@@ -61,7 +61,9 @@ def build(config: Config) -> Parts:
     finetuned = config.finetune_trials * config.task_length
 
     def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
-        return jaxpets.plan(_rollout(size, search), reward_fn, optimizer(search, env))
+        rollout = _rollout(size, search)
+        is_kernel = hasattr(rollout, "bind")  # and not the scan in its place
+        return jaxpets.plan(rollout, reward_fn, optimizer(search, env, is_kernel))
 
     reward = half_cheetah.task_reward
     if config.pessimism:
@@ -142,7 +144,8 @@ def _ensemble(
 
 def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.RolloutFn:
     precision = jaxpets.Precision(search.precision)
-    if _wants_kernel(search):
+    is_bf16 = precision is jaxpets.Precision.BF16
+    if search.fused and is_bf16 and jax.default_backend() == "gpu":
         return jaxpets.fused_rollout(
             dataclasses.replace(size, precision=precision),
             half_cheetah.model_space(),
@@ -157,11 +160,6 @@ def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.Ro
     )
 
 
-def _wants_kernel(search: PlannerNumbers) -> bool:
-    is_bf16 = jaxpets.Precision(search.precision) is jaxpets.Precision.BF16
-    return search.fused and is_bf16 and jax.default_backend() == "gpu"
-
-
 def _weight_decays(num_layers: int) -> tuple[float, ...]:
     """Spreads the decays of PETS, given for four hidden layers, over any number."""
     first, second, *middle, last = jaxpets.EnsembleConfig().weight_decays
@@ -169,8 +167,10 @@ def _weight_decays(num_layers: int) -> tuple[float, ...]:
     return (first, *inner, last)
 
 
-def optimizer(numbers: PlannerNumbers, env: jaxpets.Env) -> jaxpets.TrajectoryOptimizer:
-    """Returns the search that the numbers describe."""
+def optimizer(
+    numbers: PlannerNumbers, env: jaxpets.Env, unroll: bool = False
+) -> jaxpets.TrajectoryOptimizer:
+    """Returns the search that the numbers describe; unroll is that of `cem`."""
     size = {
         "horizon": numbers.horizon,
         "action_low": env.action_low,
@@ -183,6 +183,4 @@ def optimizer(numbers: PlannerNumbers, env: jaxpets.Env) -> jaxpets.TrajectoryOp
     size |= {"num_elites": numbers.num_elites, "momentum": numbers.momentum}
     if numbers.optimizer == "icem":
         return jaxpets.icem(**size, noise_beta=numbers.noise_beta)
-    return jaxpets.cem(
-        **size, legacy_variance=numbers.legacy_variance, unroll=_wants_kernel(numbers)
-    )
+    return jaxpets.cem(**size, legacy_variance=numbers.legacy_variance, unroll=unroll)

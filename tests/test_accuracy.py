@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import toys
 
+import jaxpets
 from benchmarks import accuracy, workloads
 from experiments import checkpoint, cli, phases, rundir
 from experiments.build import build
@@ -71,7 +73,8 @@ def performed(tmp_path_factory):
     model = phases.model_of(phases.explored_template(config, build(config)))
     model = model._replace(params=params)
     checkpoint.save(folder / "checkpoints", 60, model, {}, finite=model)
-    obs = np.random.default_rng(0).normal(size=(2, 4, 1, 50, half_cheetah.OBS_SIZE))
+    obs = np.random.default_rng(0).normal(size=(2, 4, 2, 50, half_cheetah.OBS_SIZE))
+    obs[:, :, 1] *= 5  # other trials spread wider
     np.savez(folder / "trajectories.npz", obs=obs.astype(np.float32))
     return folder
 
@@ -84,6 +87,45 @@ def test_states_are_of_the_first_seed_and_all_tasks(performed):
     for task, start in enumerate(starts):
         assert any(np.array_equal(start, state) for state in obs[0, task, 0])
     np.testing.assert_allclose(scale, obs[0].std((0, 1, 2)), rtol=1e-5)
+    with pytest.raises(SystemExit, match="--states 50: the trials have 50 steps"):
+        accuracy.states(performed / "trajectories.npz", 50)
+    with pytest.raises(SystemExit, match="there is no"):
+        accuracy.states(performed / "nothing.npz", 4)
+
+
+def test_values_are_those_that_a_planner_sees(performed):
+    """Of the first seed's model: the same candidates, noise and rewards."""
+    params, size = accuracy.explored(performed, SIZE)
+    keys = jax.random.split(jax.random.key(0), 2)
+    of_seed = jax.jit(functools.partial(workloads.params, size))(keys[0])
+    # Mapped over seeds the fixture rounds otherwise; another seed is off by 0.1.
+    close = functools.partial(np.testing.assert_allclose, atol=1e-5)
+    jax.tree.map(close, params, of_seed)
+    obs = jnp.full(half_cheetah.OBS_SIZE, 0.1)
+    actions = jax.random.uniform(keys[1], (10, 3, half_cheetah.ACTION_SIZE))
+    path, values = accuracy.imagine(params, size, "f32")(keys[1], obs, actions)
+    assert path.shape == (10, 4, 5, 1, half_cheetah.OBS_SIZE)
+    seen = {
+        "epistemic": (jaxpets.rewards.epistemic, jaxpets.max_variance(params)),
+        "forward": (half_cheetah.task_reward, half_cheetah.task("forward")),
+        "back-flip": (half_cheetah.task_reward, half_cheetah.task("back-flip")),
+    }
+    for reward, (reward_fn, weights) in seen.items():
+        rollout = workloads.rollout_fn(size, "f32")
+        planner = jaxpets.plan(rollout, reward_fn, toys.probe(actions))
+        dynamics = jaxpets.PlanParams(params, weights)
+        _, wanted = jax.jit(planner.step)(dynamics, keys[1], planner.init(), obs)
+        np.testing.assert_allclose(values[reward], wanted, rtol=1e-5, atol=1e-5)
+        assert np.ptp(wanted) > 1e-3
+
+
+def test_what_is_not_finite_is_worst_and_no_number():
+    nan = imagines(jnp.nan, np.arange(10))
+    starts = jnp.ones((3, half_cheetah.OBS_SIZE))
+    error, _ = accuracy.compare(
+        imagines(1.0, np.arange(10)), nan, starts, jnp.zeros(18), SIZE
+    )
+    assert accuracy._number(np.max([0.0, *error, 0.0])) is None
 
 
 def test_program_compares_an_explored_model(performed, tmp_path):
@@ -108,12 +150,25 @@ def test_a_folder_without_a_model_is_refused(performed, tmp_path):
         accuracy.explored(tmp_path, SIZE)
 
 
-def test_another_margin_is_refused(performed, tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"state_margin": None}, "has its own --model"),
+        ({"num_members": 1}, "has 1 members; they must be 2 or more"),
+        ({"num_members": 4}, "divide the 5 particles"),
+    ],
+)
+def test_models_that_cannot_be_compared_are_refused(performed, tmp_path, changes, text):
     config = json.loads((performed / "config.json").read_text())
-    config["model"]["state_margin"] = None
+    config["model"] |= changes
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(SystemExit, match="has its own --model"):
+    with pytest.raises(SystemExit, match=text):
         accuracy.explored(tmp_path, SIZE)
+
+
+def test_no_folder_is_refused(tmp_path):
+    with pytest.raises(SystemExit, match="cannot read"):
+        accuracy.explored(tmp_path / "nothing", SIZE)
 
 
 def test_no_kernel_is_timed_where_none_runs(performed):

@@ -24,3 +24,39 @@ def test_pessimism_lowers_what_a_plan_is_worth():
     plain, doubtful = value(), value("--pessimism", "2")
     assert doubtful < plain
     assert value("--pessimism", "0") == pytest.approx(plain)
+
+
+@pytest.mark.parametrize("fallback", [False, True])
+@pytest.mark.parametrize(
+    ("backend", "flags", "wanted"),
+    [
+        ("gpu", ("bf16", "--planner.fused"), True),
+        ("gpu", ("bf16", "--planner.no-fused"), False),
+        ("gpu", ("f32", "--planner.fused"), False),
+        ("cpu", ("bf16", "--planner.fused"), False),
+    ],
+)
+def test_a_search_is_unrolled_beside_a_kernel_only(
+    monkeypatch, backend, flags, wanted, fallback
+):
+    """Where fused_rollout gives the scan instead, the search stays a loop."""
+    searches = []
+
+    class Kernel:
+        def bind(self, params):
+            raise AssertionError("nothing is imagined here")
+
+    def cem(*, unroll, **size):
+        searches.append(unroll)
+        return search(**size)
+
+    search, scan = jaxpets.cem, jaxpets.particle_rollout
+    kernel = scan(lambda *_: None, num_members=3, num_particles=3)
+    kernel = kernel if fallback else Kernel()
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jaxpets, "fused_rollout", lambda *_, **__: kernel)
+    monkeypatch.setattr(jaxpets, "cem", cem)
+    precision, fused = flags
+    phase = ["--phase", "explore", "--preset", "smoke", "--allow-cpu"]
+    build(cli.parse([*phase, "--planner.precision", precision, fused]))
+    assert searches[0] is (wanted and not fallback)

@@ -91,6 +91,8 @@ def test_unroll_compiles_every_iteration():
         return len(re.findall(r"top_k\b|sort\(|TopK", text))
 
     assert num_selections(unroll=True) == 3 * num_selections(unroll=False) > 0
+    assert num_selections(unroll=np.True_) == num_selections(unroll=True)
+    assert num_selections(unroll=np.False_) == num_selections(unroll=False)
 
 
 def test_legacy_variance_narrows_faster():

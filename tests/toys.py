@@ -51,6 +51,9 @@ OPTIMIZERS = {
     "cem": lambda **box: jaxpets.cem(
         num_samples=64, num_elites=8, num_iterations=3, **box
     ),
+    "cem-unrolled": lambda **box: jaxpets.cem(
+        num_samples=64, num_elites=8, num_iterations=3, unroll=True, **box
+    ),
     "icem": lambda **box: jaxpets.icem(
         num_samples=48, num_elites=6, num_iterations=2, **box
     ),

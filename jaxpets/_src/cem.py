@@ -58,8 +58,9 @@ def cem(
       legacy_variance: take the elites' variance without momentum, as the first
         public PETS code did by mistake until November 2018.
       unroll: compile the iterations one after the other and not as a loop. The search
-        is the same. With `fused_rollout`, where a loop's own programs count, a plan is
-        up to 2 % faster, and its code num_iterations times as long.
+        is the same, its code num_iterations times as long; on a CPU it may need more
+        memory. For rollouts as short as those of `fused_rollout`, beside which the
+        programs that a loop adds on a GPU count.
 
     Returns:
       A TrajectoryOptimizer.
@@ -130,7 +131,7 @@ def cem(
         variance = jnp.broadcast_to(half_width**2 / 4, shape)
         start = (state.mean, variance, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
-        (mean, _, value), _ = jax.lax.scan(iterate, start, keys, unroll=unroll)
+        (mean, _, value), _ = jax.lax.scan(iterate, start, keys, unroll=bool(unroll))
         shifted = jnp.concatenate([mean[1:], center[None]])
         return Solution(actions=mean, value=value), CEMState(mean=shifted)
 

@@ -130,8 +130,8 @@ def _variance_of_means(baseline_variance: Array, next_obs: Array) -> Array:
     check_array("next_obs", next_obs, ["E", "P", "D"])
     check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
     _check_members(next_obs.shape[0])
-    # Written out member by member, so that XLA reads the path once: of jnp.var it makes
-    # three programs on a GPU, of which one writes the means and one reads them again.
+    # Member by member, so that XLA reads the path once: of jnp.var it makes three GPU
+    # programs, which write the means and read them again. The code grows with E.
     means = [jnp.mean(member, axis=0) for member in next_obs]
     center = functools.reduce(jnp.add, means) / len(means)
     squares = [(mean - center) ** 2 for mean in means]
@@ -139,7 +139,7 @@ def _variance_of_means(baseline_variance: Array, next_obs: Array) -> Array:
 
 
 def _mean(x: Array) -> Array:
-    # Divided before it is summed: XLA then makes one sum of this and that over time.
+    # Divided first, so that XLA merges this sum with the planner's sum over time.
     return jnp.sum(x / x.size)
 
 
