@@ -168,30 +168,6 @@ def planner(
     )
 
 
-def products(size: Size, precision: str, side: int) -> list[tuple[float, Callable]]:
-    """Returns bare matrix products, each with its operations and its compiled call.
-
-    They are a square of `side`, and the batch of a hidden layer of one model step,
-    `[E, N * P, W] x [E, W, W]`, both in the precision of the network's products.
-    """
-    rows = size.num_samples * size.num_particles // size.num_members
-    width = size.hidden_sizes[0]
-    dtype = jnp.bfloat16 if precision == "bf16" else jnp.float32
-    exact = jax.lax.Precision.HIGHEST if precision == "f32" else None
-
-    def product(x: Array, y: Array) -> Array:
-        return jnp.matmul(x, y, precision=exact, preferred_element_type=jnp.float32)
-
-    done = []
-    for batch, many, inner in [(1, side, side), (size.num_members, rows, width)]:
-        x = jnp.full((batch, many, inner), 0.5, dtype)
-        y = jnp.full((batch, inner, inner), 0.5, dtype)
-        compiled = jax.jit(product).lower(x, y).compile()
-        call = functools.partial(compiled, x, y)
-        done.append((2.0 * batch * many * inner**2, call))
-    return done
-
-
 def fitter(size: Size, num_epochs: int = 5, batch_size: int = 32) -> jaxpets.Fitter:
     """Returns the trainer of PETS, in TF32 where the hardware has it."""
     config = jaxpets.FitConfig(num_epochs=num_epochs, batch_size=batch_size)
