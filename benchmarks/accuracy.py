@@ -161,23 +161,22 @@ def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> 
         for task in half_cheetah.TASK_NAMES
     }
 
-    def value(
-        reward_fn: jaxpets.RewardFn, weights: Any, path: Array, actions: Array
-    ) -> Array:
-        def one(obs: Array, action: Array, next_obs: Array) -> Array:
-            return jnp.mean(reward_fn(weights, obs, action, next_obs))
-
-        steps = (path[:, :-1], actions, path[:, 1:])
-        total = jax.vmap(jax.vmap(one))(*steps).sum(1)
-        return jnp.where(jnp.isfinite(total), total, jaxpets.WORST_VALUE)
-
     def imagined(
         params: jaxpets.EnsembleParams, key: Array, obs: Array, actions: Array
     ) -> tuple[Array, dict[str, Array]]:
         path = rollout(params, key, obs, actions)
-        return path, {
-            reward: value(*parts, path, actions) for reward, parts in rewards.items()
-        }
+
+        def score(objective_fn: jaxpets.ObjectiveFn, key: Array, state: tuple) -> Any:
+            values = objective_fn(key, actions)
+            return jaxpets.Solution(actions[0], values[0]), values
+
+        def values(reward_fn: jaxpets.RewardFn, weights: Any) -> Array:
+            """What a planner that has imagined the path sees of the candidates."""
+            search = jaxpets.TrajectoryOptimizer(tuple, score)
+            planner = jaxpets.plan(lambda *_: path, reward_fn, search)
+            return planner.step(jaxpets.PlanParams(None, weights), key, (), obs)[1]
+
+        return path, {reward: values(*parts) for reward, parts in rewards.items()}
 
     return functools.partial(jax.jit(imagined), params)
 
