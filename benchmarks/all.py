@@ -15,7 +15,7 @@ SET = (
     # Last: these end where no kernel runs.
     (plan, "--engine scan kernel --seeds 1 4 16"),
     (plan, "--engine scan kernel --seeds 1 4 16 --plans 10"),
-    (plan, "--engine kernel --seeds 1 --num-samples 125 250 1000 2000 4000 8000"),
+    (plan, "--engine scan kernel --seeds 1 --num-samples 125 250 1000 2000 4000 8000"),
     (trace, "--seeds 1 4 16"),
 )
 
