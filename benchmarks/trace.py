@@ -31,6 +31,8 @@ _PLANS = 10
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every number of seeds."""
+    if jax.default_backend() != "gpu":
+        raise SystemExit("there is no GPU whose programs could be traced")
     size = workloads.chosen_size(args)
     planner = workloads.planner(size, "bf16", engine="kernel")
     prepare = jax.jit(jax.vmap(workloads.plan_inputs(size, planner)))

@@ -135,7 +135,8 @@ def optimizer(
 ) -> jaxpets.TrajectoryOptimizer:
     """Returns `cem` or `icem` at this size, as the experiment has it for the engine."""
     one = jnp.ones((half_cheetah.ACTION_SIZE,), jnp.float32)
-    cem = functools.partial(jaxpets.cem, unroll=engine == "kernel")
+    unroll = engine == "kernel" and jax.default_backend() == "gpu"
+    cem = functools.partial(jaxpets.cem, unroll=unroll)
     build = {"cem": cem, "icem": jaxpets.icem}[name]
     return build(
         horizon=size.horizon,

@@ -63,7 +63,8 @@ def build(config: Config) -> Parts:
     def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
         rollout = _rollout(size, search)
         is_kernel = hasattr(rollout, "bind")  # and not the scan in its place
-        return jaxpets.plan(rollout, reward_fn, optimizer(search, env, is_kernel))
+        unroll = is_kernel and jax.default_backend() == "gpu"
+        return jaxpets.plan(rollout, reward_fn, optimizer(search, env, unroll))
 
     reward = half_cheetah.task_reward
     if config.pessimism:
@@ -144,8 +145,8 @@ def _ensemble(
 
 def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.RolloutFn:
     precision = jaxpets.Precision(search.precision)
-    is_bf16 = precision is jaxpets.Precision.BF16
-    if search.fused and is_bf16 and jax.default_backend() == "gpu":
+    has_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
+    if search.fused and has_kernel.get(jax.default_backend(), False):
         return jaxpets.fused_rollout(
             dataclasses.replace(size, precision=precision),
             half_cheetah.model_space(),

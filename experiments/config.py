@@ -80,7 +80,8 @@ class PlannerNumbers:
     precision: Literal["f32", "tf32", "bf16"] = "bf16"
     """Of the matrix products while planning; training always uses tf32 or better."""
     fused: bool = True
-    """With bf16: imagine in one kernel, on GPUs that can (H100, H200)."""
+    """Imagine in one kernel: on CPUs, in float32 whatever the precision, and with bf16
+    on GPUs that can (H100, H200)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import json
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -289,6 +290,19 @@ def test_a_trace_is_summed_over_the_streams_of_the_gpu():
     assert row["ms_per_plan"] == pytest.approx(0.05)
 
 
-def test_where_no_kernel_runs_nothing_is_traced():
-    with pytest.raises(SystemExit, match="no kernel to time"):
+def test_where_no_kernel_runs_none_is_timed(monkeypatch):
+    device = SimpleNamespace(platform="tpu")
+    monkeypatch.setattr(jax, "devices", lambda: [device])
+    with pytest.raises(SystemExit, match=r"no kernel to time: .* is a tpu, not a"):
+        plan.main(["--tiny", "--seeds", "1", "--engine", "kernel"])
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the kernel of a CPU")
+def test_on_a_cpu_the_kernel_is_timed_but_not_traced():
+    size = workloads.named_size("tiny")
+    rollout, args = workloads.rollout_work(size, "f32", "kernel")
+    assert hasattr(rollout, "bind")  # and is not the scan
+    want = jax.jit(workloads.rollout_fn(size, "f32"))(*args)
+    np.testing.assert_allclose(jax.jit(rollout)(*args), want, rtol=1e-5, atol=1e-5)
+    with pytest.raises(SystemExit, match="there is no GPU whose programs"):
         trace.main(["--tiny", "--seeds", "1"])

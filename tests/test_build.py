@@ -34,9 +34,10 @@ def test_pessimism_lowers_what_a_plan_is_worth():
         ("gpu", ("bf16", "--planner.no-fused"), False),
         ("gpu", ("f32", "--planner.fused"), False),
         ("cpu", ("bf16", "--planner.fused"), False),
+        ("cpu", ("f32", "--planner.fused"), False),
     ],
 )
-def test_a_search_is_unrolled_beside_a_kernel_only(
+def test_a_search_is_unrolled_beside_a_kernel_of_a_gpu_only(
     monkeypatch, backend, flags, wanted, fallback
 ):
     """Where fused_rollout gives the scan instead, the search stays a loop."""
@@ -60,3 +61,45 @@ def test_a_search_is_unrolled_beside_a_kernel_only(
     phase = ["--phase", "explore", "--preset", "smoke", "--allow-cpu"]
     build(cli.parse([*phase, "--planner.precision", precision, fused]))
     assert searches[0] is (wanted and not fallback)
+
+
+@pytest.mark.parametrize(
+    ("backend", "precision", "wanted"),
+    [
+        ("cpu", "f32", True),
+        ("cpu", "tf32", True),
+        ("cpu", "bf16", True),
+        ("gpu", "tf32", False),
+        ("gpu", "bf16", True),
+        ("tpu", "bf16", False),
+    ],
+)
+def test_a_kernel_is_asked_for_where_there_may_be_one(
+    monkeypatch, backend, precision, wanted
+):
+    """Elsewhere it would warn that there is none."""
+    asked = []
+    scan = jaxpets.particle_rollout(lambda *_: None, num_members=3, num_particles=3)
+
+    def fused(config, *_, **__):
+        asked.append(config.precision)
+        return scan
+
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jaxpets, "fused_rollout", fused)
+    phase = ["--phase", "explore", "--preset", "smoke", "--allow-cpu"]
+    flags = [*phase, "--planner.precision", precision]
+    build(cli.parse(flags))
+    assert (jaxpets.Precision(precision) in asked) is wanted
+    asked.clear()
+    build(cli.parse([*flags, "--planner.no-fused", "--task-planner.no-fused"]))
+    assert not asked
+
+
+def test_on_a_cpu_a_plan_is_that_of_the_scan():
+    """What the kernel and the scan in float32 imagine differs by 1e-6."""
+    if jax.default_backend() != "cpu":
+        pytest.skip("the kernel of a GPU is less exact")
+    flags = ["--task-planner.precision", "f32"]
+    got, want = value(*flags), value(*flags, "--task-planner.no-fused")
+    assert float(got) == pytest.approx(float(want), rel=1e-4)

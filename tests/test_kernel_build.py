@@ -1,6 +1,7 @@
 """The kernel is compiled once per model, kept whole, and every failure says why."""
 
 import ctypes
+import platform
 import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +12,7 @@ import jax
 import pytest
 
 from jaxpets._src.kernel import build
-from jaxpets._src.kernel.build import BuildError
+from jaxpets._src.kernel.build import BuildError, Kind
 
 # Without a cache in memory: what a process does the first time.
 load = build.load_kernel.__wrapped__
@@ -30,6 +31,8 @@ def commands(monkeypatch):
     run, seen = subprocess.run, []
 
     def fake(command, **options):
+        if "-dM" in command:  # asks about the processor, and makes nothing
+            return run(command, **options)
         seen.append(command)
         source = Path(command[-1]).with_name("tiny.c")
         source.write_text("int jaxpets_rollout(void) { return 0; }")
@@ -53,33 +56,112 @@ def registered(monkeypatch):
 
 
 def test_one_compilation_per_model(cache, commands, registered):
-    target = load("// one", cuda=False)
-    assert load("// one", cuda=False) == target  # as the next process does
+    target = load("// one", Kind.REFERENCE)
+    assert load("// one", Kind.REFERENCE) == target  # as the next process does
     assert len(commands) == 1
-    other = load("// two", cuda=False)
+    other = load("// two", Kind.REFERENCE)
     assert other != target and len(commands) == 2
     assert registered == [(name, "cpu") for name in (target, target, other)]
     assert {path.name for path in cache.iterdir()} == {f"{target}.so", f"{other}.so"}
 
 
 def test_a_process_asks_once(commands, registered):
-    build.load_kernel("// asked twice", cuda=False)
-    target = build.load_kernel("// asked twice", cuda=False)
+    build.load_kernel("// asked twice", Kind.REFERENCE)
+    target = build.load_kernel("// asked twice", Kind.REFERENCE)
     assert len(commands) == 1 and registered == [(target, "cpu")]
-    assert target.startswith("jaxpets_rollout_cpu_")
+    assert target.startswith("jaxpets_rollout_reference_")
 
 
+@pytest.mark.parametrize("kind", [Kind.CPU, Kind.REFERENCE])
 @pytest.mark.parametrize("change", ["sources", "jax", "compiler"])
-def test_another_recipe_is_another_kernel(monkeypatch, commands, registered, change):
-    target = load("// one", cuda=False)
+def test_another_recipe_is_another_kernel(
+    monkeypatch, commands, registered, change, kind
+):
+    target = load("// one", kind)
     if change == "sources":
         monkeypatch.setattr(build, "_SOURCES", build._SOURCES[:-1])
     if change == "jax":
         monkeypatch.setattr(jax, "__version__", "0.0.1")
     if change == "compiler":
-        monkeypatch.setattr(build, "_host_compiler", lambda: ["clang++", "-O3"])
-    assert load("// one", cuda=False) != target
+        flags = build._host_compiler()
+        monkeypatch.setattr(build, "_host_compiler", lambda: [*flags, "-g"])
+    assert load("// one", kind) != target
     assert len(commands) == 2
+
+
+def test_every_kind_is_a_library_of_its_own(cache, monkeypatch, commands, registered):
+    there = shutil.which("c++")
+    monkeypatch.setattr(shutil, "which", {"c++": there, "nvcc": "/path/nvcc"}.get)
+    targets = [load("// one", kind) for kind in Kind]
+    for kind, target, command in zip(Kind, targets, commands, strict=True):
+        assert target.startswith(f"jaxpets_rollout_{kind.name.lower()}_")
+        assert Path(command[-1]).name == kind.value
+    assert {path.name for path in cache.iterdir()} == {f"{t}.so" for t in targets}
+    platforms = {Kind.GPU: "CUDA", Kind.CPU: "cpu", Kind.REFERENCE: "cpu"}
+    assert registered == list(zip(targets, platforms.values(), strict=True))
+
+
+def test_a_processor_has_a_library_of_its_own(monkeypatch, commands, registered):
+    """Where machines share a folder; the reference is for all of them."""
+    target, shared = load("// one", Kind.CPU), load("// one", Kind.REFERENCE)
+    told = build._instructions
+    monkeypatch.setattr(
+        build, "_instructions", lambda command: told(command) + "#define __MORE__ 1"
+    )
+    assert load("// one", Kind.CPU) != target
+    assert load("// one", Kind.REFERENCE) == shared
+    assert len(commands) == 3
+
+
+def test_what_the_processor_can_do_is_what_the_compiler_says():
+    command = build._compiler(Kind.CPU)
+    said = build._instructions(command)
+    assert "#define __cplusplus" in said
+    if platform.machine() == "x86_64":
+        # Of the oldest processor of the kind, which has less than any since.
+        least = [f.replace("-march=native", "-march=x86-64") for f in command]
+        assert build._instructions(least) != said
+
+
+@pytest.mark.parametrize(
+    ("machine", "flag"),
+    [
+        ("x86_64", "-march=native"),
+        ("AMD64", "-march=native"),
+        ("aarch64", "-mcpu=native"),
+        ("arm64", "-mcpu=native"),
+    ],
+)
+def test_a_cpu_is_built_for_by_its_name(monkeypatch, machine, flag):
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    command = build._compiler(Kind.CPU)
+    assert flag in command and "-O3" in command
+    assert command.index("-O3") > command.index("-O2")  # the last one counts
+    assert not any("native" in word for word in build._compiler(Kind.REFERENCE))
+
+
+def test_a_processor_that_is_not_known_says_so(monkeypatch, registered):
+    def fake(command, **options):
+        assert "-dM" in command  # and nothing is compiled
+        text = "cc1plus: error: bad value ('native') for '-march=' switch\nnote: more"
+        return SimpleNamespace(returncode=1, stdout="", stderr=text)
+
+    monkeypatch.setattr(subprocess, "run", fake)
+    with pytest.raises(
+        BuildError, match=r"^\S+ failed: cc1plus: error: bad value .*ch$"
+    ):
+        load("// one", Kind.CPU)
+    assert not registered
+
+
+def test_a_compiler_that_cannot_be_run_says_so(monkeypatch, tmp_path):
+    path = tmp_path / "c++"
+    path.write_text("")
+    path.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for kind in (Kind.CPU, Kind.REFERENCE):
+        with pytest.raises(BuildError, match=r"^cannot run c\+\+: "):
+            load("// one", kind)
 
 
 def test_all_sources_are_given_to_the_compiler(monkeypatch, registered):
@@ -93,7 +175,7 @@ def test_all_sources_are_given_to_the_compiler(monkeypatch, registered):
 
     monkeypatch.setattr(subprocess, "run", fake)
     with pytest.raises(BuildError, match="failed: no message"):
-        load("// the model", cuda=False)
+        load("// the model", Kind.REFERENCE)
     assert set(seen) == {*build._SOURCES, "model.h"}
     assert seen["model.h"] == "// the model"
     folder = Path(build.__file__).parent
@@ -116,7 +198,7 @@ def test_without_xdg_the_cache_is_in_the_home_folder(monkeypatch, tmp_path):
 def test_many_may_build_at_once(cache, commands, registered):
     """Each into a folder of its own; whoever is last replaces a whole by a whole."""
     with ThreadPoolExecutor(4) as pool:
-        targets = list(pool.map(lambda _: load("// one", cuda=False), range(8)))
+        targets = list(pool.map(lambda _: load("// one", Kind.REFERENCE), range(8)))
     assert len(set(targets)) == 1
     outputs = [command[command.index("-o") + 1] for command in commands]
     assert len(set(outputs)) == len(outputs)
@@ -134,28 +216,28 @@ def test_a_failure_leaves_nothing_behind(cache, monkeypatch):
 
     monkeypatch.setattr(subprocess, "run", fake)
     with pytest.raises(BuildError, match=r"^\S+ failed: a.h:3:1: error: first$"):
-        load("// one", cuda=False)
+        load("// one", Kind.REFERENCE)
     assert list(cache.iterdir()) == []
     errors = "killed\nsoon\n"
     with pytest.raises(BuildError, match=r"^\S+ failed: killed$"):
-        load("// one", cuda=False)
+        load("// one", Kind.REFERENCE)
 
 
 def test_a_broken_library_says_so(cache, monkeypatch, registered):
     def fake(command, **options):
         Path(command[command.index("-o") + 1]).write_text("no library")
-        return SimpleNamespace(returncode=0)
+        return SimpleNamespace(returncode=0, stdout="")
 
     monkeypatch.setattr(subprocess, "run", fake)
     with pytest.raises(BuildError, match=r"cannot load the compiled kernel: .*\.so"):
-        load("// one", cuda=False)
+        load("// one", Kind.REFERENCE)
     assert not registered
 
 
 def test_a_cache_that_cannot_be_written_says_so(cache):
     cache.write_text("a file, where a folder should be")
     with pytest.raises(BuildError, match=r"cannot write to the cache folder: .*jax"):
-        load("// one", cuda=False)
+        load("// one", Kind.REFERENCE)
 
 
 @pytest.mark.parametrize("names", [["c++"], ["g++", "clang++"], ["clang++"], []])
@@ -203,9 +285,9 @@ def test_nvcc_is_looked_for_in_three_places(monkeypatch, tmp_path):
 
 def test_the_kernel_is_registered_for_cuda(cache, monkeypatch, commands, registered):
     monkeypatch.setattr(shutil, "which", {"nvcc": "/path/nvcc"}.get)
-    target = load("// one", cuda=True)
+    target = load("// one", Kind.GPU)
     ((command, *_, source),) = commands
     assert command == "/path/nvcc" and Path(source).name == "rollout.cu"
     assert registered == [(target, "CUDA")]
-    assert target.startswith("jaxpets_rollout_cuda_")
+    assert target.startswith("jaxpets_rollout_gpu_")
     ctypes.CDLL(str(cache / f"{target}.so"))

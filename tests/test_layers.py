@@ -24,6 +24,7 @@ LAYERS = {
     "_src.kernel.build": 0,
     "_src.kernel.row_code": 0,
     "_src.kernel.shape": 0,
+    "_src.kernel.tiles": 0,
     "_src.plan": 1,
     "_src.cem": 1,
     "_src.icem": 1,

@@ -228,8 +228,9 @@ def test_angles_of_many_turns(library, turns):
 def test_what_moves_costs_nothing():
     text = row_function("f", lambda x, y: jnp.concatenate([y[::-1], x[1:2]]), SIZES)
     assert text == (
-        "ROW_FUNCTION void f(const float (&x)[4], const float (&y)[4], "
-        "float (&out)[5]) {\n  out[0] = y[3];\n  out[1] = y[2];\n  out[2] = y[1];\n"
+        "template <class Row0, class Row1, class Out>\n"
+        "ROW_FUNCTION void f(const Row0& x, const Row1& y, Out&& out) {\n"
+        "  out[0] = y[3];\n  out[1] = y[2];\n  out[2] = y[1];\n"
         "  out[3] = y[0];\n  out[4] = x[1];\n}\n"
     )
 
@@ -242,10 +243,9 @@ def test_what_is_known_is_computed_now():
 
 
 def test_rows_have_the_sizes_that_were_asked_for():
-    text = row_function("f", lambda a: a[:1], [("a", 7)])
-    assert text.startswith(
-        "ROW_FUNCTION void f(const float (&a)[7], float (&out)[1]) {"
-    )
+    text = row_function("f", lambda a: a[::-1], [("a", 7)])
+    assert "out[0] = a[6];" in text and "out[6] = a[0];" in text
+    assert "[7]" not in text
 
 
 def test_strict_promotion_and_tracing_around_it():

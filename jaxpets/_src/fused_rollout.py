@@ -1,4 +1,4 @@
-"""Trajectory sampling as one GPU kernel: all steps of all particles in one launch."""
+"""Trajectory sampling as one kernel: all steps of all particles in one call."""
 
 import dataclasses
 import warnings
@@ -17,9 +17,10 @@ from jaxpets._src.ensemble import (
     ensemble,
     imagined_range,
 )
-from jaxpets._src.kernel.build import BuildError, load_kernel
+from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
 from jaxpets._src.kernel.row_code import UnsupportedError, row_function
 from jaxpets._src.kernel.shape import KernelShape
+from jaxpets._src.kernel.tiles import TileShape
 from jaxpets._src.network import Precision
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import ModelSpace, RolloutFn
@@ -34,23 +35,26 @@ def fused_rollout(
     num_particles: int,
     interpret: bool = False,
 ) -> RolloutFn:
-    """Builds the particle rollout of an ensemble as one kernel for Hopper GPUs.
+    """Builds the particle rollout of an ensemble as one kernel, for H100s and CPUs.
 
     It computes what `particle_rollout(ensemble(config, space, ...).sample, ...)` does,
-    with the same noise for the same key. Products read float16 and add up in float32:
-    closer to float32 than the scan in bfloat16, but an input of the network, or of one
-    of its layers, beyond 65504 is infinite and leads to NaN, which a planner counts as
-    the worst. Where there can be no kernel the scan runs, and a warning of one line
-    says why:
+    with the same noise for the same key. On a CPU products read and add up float32,
+    whatever the precision. On a GPU they read float16 and add up in float32: closer to
+    float32 than the scan in bfloat16, but an input of the network, or of one of its
+    layers, beyond 65504 is infinite and leads to NaN, which a planner counts as the
+    worst. The kernel is for the first device of `jax.devices()`. Where there can be
+    none the scan runs, and a warning of one line says why:
 
-    - `config.precision` is not BF16, the only precision the kernel has;
-    - the first device is no GPU of compute capability 9.0 (H100, H200, GH200);
-    - a hidden layer has more than 256 units, an observation more than 128 entries, or
-      features and action together more than 256;
     - `space` does more than arithmetic on single entries, moving them and summing;
     - there is no compiler: the kernel is built for the model at the first call, in
-      half a minute, and kept in the user's cache folder;
-    - keys are not of JAX's default kind, partitionable threefry.
+      half a minute on a GPU and in seconds on a CPU, and kept in the user's cache
+      folder;
+    - keys are not of JAX's default kind, partitionable threefry;
+    - the device is neither a CPU nor a GPU of compute capability 9.0 (H100, H200,
+      GH200);
+    - on a GPU, `config.precision` is not BF16, a hidden layer has more than 256 units,
+      an observation more than 128 entries, or features and action together more than
+      256.
 
     Any number of members, particles, candidates, steps and hidden layers will do, and
     any nest of up to four `jax.vmap`.
@@ -61,7 +65,7 @@ def fused_rollout(
       obs_size: D.
       action_size: A.
       num_particles: E * P, over all members.
-      interpret: run the kernel's arithmetic on the CPU, slowly, for tests.
+      interpret: run the GPU kernel's arithmetic on the CPU, slowly, for tests.
 
     Returns:
       A RolloutFn whose params are the ensemble's, and whose start is `[D]`.
@@ -75,9 +79,19 @@ def fused_rollout(
         model.sample, num_members=config.num_members, num_particles=num_particles
     )
     feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
-    shape = KernelShape(obs_size, action_size, feature_size, config.hidden_sizes)
+    sizes = (obs_size, action_size, feature_size, config.hidden_sizes)
+    device = jax.devices()[0]
     try:
-        target = _target(config, space, shape, interpret=interpret)
+        if device.platform == "cpu" and not interpret:
+            shape = TileShape(*sizes)
+            target = _target(config, space, shape, Kind.CPU)
+        else:
+            shape = KernelShape(*sizes)
+            _check_sizes(config, shape)
+            if not interpret:
+                _check_device(device)
+            kind = Kind.REFERENCE if interpret else Kind.GPU
+            target = _target(config, space, shape, kind)
     except (BuildError, UnsupportedError) as error:
         warnings.warn(f"fused_rollout runs as a scan: {error}.", stacklevel=2)
         return scan
@@ -118,15 +132,12 @@ class _FusedRollout:
 
 
 def _target(
-    config: EnsembleConfig, space: ModelSpace, shape: KernelShape, *, interpret: bool
+    config: EnsembleConfig,
+    space: ModelSpace,
+    shape: KernelShape | TileShape,
+    kind: Kind,
 ) -> str:
     """Returns the FFI target of a kernel for this model, built if need be."""
-    if config.precision is not Precision.BF16:
-        raise UnsupportedError(f"the precision is {config.precision.value}, not bf16")
-    if problem := shape.problem():
-        raise UnsupportedError(problem)
-    if not interpret:
-        _check_device(jax.devices()[0])
     rows = {name: shape.obs_size for name in ("obs", "target", "low", "high")}
     is_free = config.state_margin is None
     functions = {
@@ -134,13 +145,17 @@ def _target(
         "next_obs": (space.next_obs, ("obs", "target")),
         "bound": (_free if is_free else space.bound, ("obs", "low", "high")),
     }
+    for name in ("next_obs", "bound"):
+        function, arguments = functions[name]
+        _check_result(name, function, len(arguments), shape.obs_size)
     code = [
         row_function(name, function, [(row, rows[row]) for row in arguments])
         for name, (function, arguments) in functions.items()
     ]
-    products = [] if interpret else [shape.products()]
-    model = ['#pragma once\n#include "row.h"', shape.header(), *code, *products]
-    return load_kernel("\n".join(model), cuda=not interpret)
+    model = ['#pragma once\n#include "row.h"', shape.header(), *code]
+    if kind is Kind.GPU and isinstance(shape, KernelShape):
+        model.append(shape.products())
+    return load_kernel("\n".join(model), kind)
 
 
 def _free(obs: Array, low: Array, high: Array) -> Array:
@@ -148,9 +163,27 @@ def _free(obs: Array, low: Array, high: Array) -> Array:
     return obs
 
 
+def _check_result(
+    name: str, function: Callable[..., Array], num_arguments: int, obs_size: int
+) -> None:
+    """Checks that a result is as long as the kernel's room for it."""
+    row = jax.ShapeDtypeStruct((obs_size,), jnp.float32)
+    shape = jax.eval_shape(function, *[row] * num_arguments).shape
+    if shape != row.shape:
+        raise UnsupportedError(f"{name} makes {list(shape)} of [{obs_size}]")
+
+
+def _check_sizes(config: EnsembleConfig, shape: KernelShape) -> None:
+    """Checks what a GPU's kernel needs and a CPU's does not."""
+    if config.precision is not Precision.BF16:
+        raise UnsupportedError(f"the precision is {config.precision.value}, not bf16")
+    if problem := shape.problem():
+        raise UnsupportedError(problem)
+
+
 def _check_device(device: Any) -> None:
     if device.platform != "gpu":
-        raise UnsupportedError(f"the device is a {device.platform}, not a GPU")
+        raise UnsupportedError(f"the device is a {device.platform}, not a GPU or CPU")
     capability = getattr(device, "compute_capability", "unknown")
     if capability != "9.0":
         raise UnsupportedError(f"the GPU's compute capability is {capability}, not 9.0")

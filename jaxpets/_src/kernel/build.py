@@ -1,11 +1,13 @@
 """Compiling the kernel for one model, once, and handing it to XLA."""
 
 import ctypes
+import enum
 import functools
 import hashlib
 import importlib.resources
 import importlib.util
 import os
+import platform
 import shutil
 import subprocess
 import tempfile
@@ -13,8 +15,19 @@ from pathlib import Path
 
 import jax
 
-_SOURCES = ("row.h", "rollout.h", "handler.h", "wgmma.h", "rollout.cu", "reference.cc")
+_SOURCES = (
+    "row.h", "sizes.h", "halves.h", "tiles.h", "rollout.h", "handler.h", "wgmma.h",
+    "rollout.cu", "rollout.cc", "reference.cc",
+)  # fmt: skip
 _SYMBOL = "jaxpets_rollout"
+
+
+class Kind(enum.Enum):
+    """What is built: the source file of each."""
+
+    GPU = "rollout.cu"
+    CPU = "rollout.cc"
+    REFERENCE = "reference.cc"  # the arithmetic of the GPU's, on a CPU
 
 
 class BuildError(Exception):
@@ -22,38 +35,40 @@ class BuildError(Exception):
 
 
 @functools.cache
-def load_kernel(model: str, *, cuda: bool) -> str:
+def load_kernel(model: str, kind: Kind) -> str:
     """Compiles the rollout for a model and registers it; returns its FFI target.
 
     The library is kept in the user's cache folder and found there by the next process.
 
     Args:
       model: the text of `model.h`.
-      cuda: the kernel, else the reference for CPUs.
+      kind: what to build.
 
     Raises:
       BuildError: if it cannot be built.
     """
-    compiler = _nvcc() if cuda else _host_compiler()
+    compiler = _compiler(kind)
+    recipe = [jax.__version__, *compiler]
+    if kind is Kind.CPU:
+        # A folder that machines share has a library for every kind of processor.
+        recipe.append(_instructions(compiler))
     folder = importlib.resources.files("jaxpets._src.kernel")
     sources = {name: (folder / name).read_text() for name in _SOURCES}
     sources["model.h"] = model
-    recipe = [model, *sources.values(), *compiler, jax.__version__]
-    digest = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:16]
-    target = f"{_SYMBOL}_{'cuda' if cuda else 'cpu'}_{digest}"
+    digest = hashlib.sha256("\0".join([*recipe, *sources.values()]).encode())
+    target = f"{_SYMBOL}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
     library = _cache_folder() / f"{target}.so"
-    main = "rollout.cu" if cuda else "reference.cc"
     try:
         if not library.exists():
-            _compile(compiler, sources, main, library)
+            _compile(compiler, sources, kind.value, library)
     except OSError as error:
         raise BuildError(f"cannot write to the cache folder: {error}") from error
     try:
         handler = getattr(ctypes.CDLL(str(library)), _SYMBOL)
     except OSError as error:
         raise BuildError(f"cannot load the compiled kernel: {error}") from error
-    platform = "CUDA" if cuda else "cpu"
-    jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=platform)
+    where = "CUDA" if kind is Kind.GPU else "cpu"
+    jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
     return target
 
 
@@ -68,12 +83,26 @@ def _compile(
         built = folder / library.name
         include = [f"-I{name}", f"-I{jax.ffi.include_dir()}"]
         command = [*compiler, *include, "-o", str(built), str(folder / main)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            lines = [line for line in done.stderr.splitlines() if "error" in line]
-            first = (lines or done.stderr.splitlines() or ["no message"])[0]
-            raise BuildError(f"{Path(compiler[0]).name} failed: {first}")
+        _run(command)
         os.replace(built, library)  # whole or not at all, with others building too
+
+
+def _run(command: list[str]) -> str:
+    """Returns what a compiler prints.
+
+    Raises:
+      BuildError: if it cannot be run, or fails.
+    """
+    name = Path(command[0]).name
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise BuildError(f"cannot run {name}: {error}") from error
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines() if "error" in line]
+        first = (lines or done.stderr.splitlines() or ["no message"])[0]
+        raise BuildError(f"{name} failed: {first}")
+    return done.stdout
 
 
 def _cache_folder() -> Path:
@@ -81,11 +110,32 @@ def _cache_folder() -> Path:
     return Path(home) / "jaxpets"
 
 
+def _compiler(kind: Kind) -> list[str]:
+    """Returns the command that builds a library, without the files."""
+    if kind is Kind.GPU:
+        return _nvcc()
+    if kind is Kind.REFERENCE:
+        return _host_compiler()
+    is_x86 = platform.machine().lower() in ("x86_64", "amd64")
+    flags = ["-O3", "-march=native" if is_x86 else "-mcpu=native"]
+    # Loops that might set errno or trap do not become vector instructions.
+    return [*_host_compiler(), *flags, "-fno-math-errno", "-fno-trapping-math"]
+
+
 def _host_compiler() -> list[str]:
     for name in ("c++", "g++", "clang++"):
         if path := shutil.which(name):
             return [path, "-std=c++17", "-O2", "-shared", "-fPIC"]
     raise BuildError("no C++ compiler found (c++, g++ or clang++)")
+
+
+def _instructions(compiler: list[str]) -> str:
+    """Returns what the compiler defines for this processor.
+
+    Raises:
+      BuildError: if it does not know the processor.
+    """
+    return _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull])
 
 
 def _nvcc() -> list[str]:

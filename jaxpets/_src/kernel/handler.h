@@ -36,7 +36,7 @@ Problem read(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer keys,
   if (axes > MAX_BATCH_AXES) return {rollout, "jax.vmap is nested too deeply"};
   for (auto* operand : {&weights, &shared, &keys, &obs, &actions})
     if (operand->dimensions().size() < axes) return {rollout, "an operand lacks an axis"};
-  rollout.weights = static_cast<const uint16_t*>(weights.untyped_data());
+  rollout.weights = static_cast<const Weight*>(weights.untyped_data());
   rollout.shared = static_cast<const float*>(shared.untyped_data());
   rollout.keys = static_cast<const uint32_t*>(keys.untyped_data());
   rollout.obs = static_cast<const float*>(obs.untyped_data());

@@ -1,10 +1,10 @@
-// The same rollout in plain C++, from the same operands: what the GPU kernel computes,
+// The GPU kernel's rollout in plain C++, from the same operands: what it computes,
 // without its instructions. For tests on machines without a GPU.
-
-#include "rollout.h"
 
 #include <vector>
 
+#include "halves.h"
+// The layout comes first.
 #include "handler.h"
 
 namespace {

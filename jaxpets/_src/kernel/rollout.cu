@@ -14,8 +14,9 @@
 
 #include <cuda_fp16.h>
 
+#include "halves.h"
+// The layout comes first.
 #include "handler.h"
-#include "rollout.h"
 #include "wgmma.h"
 
 namespace {

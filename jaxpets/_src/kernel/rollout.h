@@ -1,33 +1,11 @@
-// The rollout's operands, and how they lie in memory; GPU kernel and CPU reference share
-// this file. Sizes come from model.h, which is generated for one kind of model.
+// The rollout's operands, and how they lie in memory, for GPU and CPU. The layout of the
+// weights, halves.h or tiles.h, is included before.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 
-#include "model.h"
-#include "row.h"
-
-constexpr int round_up(int x, int multiple) {
-  return (x + multiple - 1) / multiple * multiple;
-}
-
-// Products are cut along the inner dimension into chunks of 16, the depth of one tensor
-// core instruction. A chunk holds 16 x columns weights as blocks of 8 x 8. Two rows hold
-// the bias, rounded, and what rounding left; activations end in two ones for them.
-constexpr int DEPTH = 16;
-constexpr int INPUTS = FEATURES + ACTION;
-constexpr int INPUT_CHUNKS = round_up(INPUTS + 2, DEPTH) / DEPTH;
-constexpr int HIDDEN_CHUNKS = round_up(WIDTH + 2, DEPTH) / DEPTH;
-constexpr int HEAD = round_up(OBS, 8);  // columns for means, then as many for variances
-// A hidden layer is computed in two halves; all chunks of the first come first.
-constexpr int LEFT = round_up(round_up(WIDTH, 16) / 2, 16);
-constexpr int RIGHT = WIDTH - LEFT;
-constexpr int INPUT_WEIGHTS = INPUT_CHUNKS * DEPTH * WIDTH;
-constexpr int HIDDEN_WEIGHTS = HIDDEN_CHUNKS * DEPTH * WIDTH;
-constexpr int OUTPUT_WEIGHTS = HIDDEN_CHUNKS * DEPTH * 2 * HEAD;
-constexpr int MEMBER_WEIGHTS =
-    INPUT_WEIGHTS + (LAYERS - 1) * HIDDEN_WEIGHTS + OUTPUT_WEIGHTS;
+#include "sizes.h"
 
 // Numbers that members share, one array after the other, each padded so that four can
 // be read at once.
@@ -51,12 +29,12 @@ struct BatchAxis {
 constexpr int MAX_BATCH_AXES = 4;
 
 struct Rollout {
-  const uint16_t* weights;  // [E, MEMBER_WEIGHTS] float16
-  const float* shared;      // [SHARED_NUMBERS]
-  const uint32_t* keys;     // [H, KEY]
-  const float* obs;         // [OBS]
-  const float* actions;     // [N, H, ACTION]
-  float* path;              // [N, H + 1, E, P, OBS]
+  const Weight* weights;  // [E, MEMBER_WEIGHTS]
+  const float* shared;    // [SHARED_NUMBERS]
+  const uint32_t* keys;   // [H, KEY]
+  const float* obs;       // [OBS]
+  const float* actions;   // [N, H, ACTION]
+  float* path;            // [N, H + 1, E, P, OBS]
   int num_members, num_candidates, horizon, particles;  // E, N, H, P
   int64_t batch;
   BatchAxis axes[MAX_BATCH_AXES];

@@ -111,10 +111,14 @@ def row_function(
     stores = [
         f"out[{i}] = {_text(value)};" for i, value in enumerate(result.reshape(-1))
     ]
-    arguments = [f"const float (&{argument})[{size}]" for argument, size in sizes]
-    arguments.append(f"float (&out)[{result.size}]")
+    types = [f"class Row{i}" for i in range(len(sizes))]
+    arguments = [f"const Row{i}& {name}" for i, (name, _) in enumerate(sizes)]
     body = "\n  ".join([*writer.lines, *stores])
-    return f"ROW_FUNCTION void {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
+    return (
+        f"template <{', '.join(types)}, class Out>\n"
+        f"ROW_FUNCTION void {name}({', '.join(arguments)}, Out&& out) {{\n"
+        f"  {body}\n}}\n"
+    )
 
 
 class _Writer:

@@ -1,0 +1,236 @@
+// A whole particle rollout on the cores of a CPU, in float32.
+//
+// A block is a few particles of one member, imagined for all H steps by one core. Entry
+// i of all its particles is one row of BLOCK numbers: what is done to a particle is a
+// loop over a row, which the compiler turns into vector instructions. A block's
+// activations stay in the core's first cache and a member's weights in its second.
+// Nothing but the path is written to memory, and cores meet only at the end.
+
+#include <atomic>
+#include <condition_variable>
+#include <memory>
+#include <mutex>
+
+#include "tiles.h"
+// The layout comes first.
+#include "handler.h"
+
+namespace {
+
+// A tile's sums are VECTORS registers for each of its TILE outputs; beside them go the
+// inputs and one weight.
+#if defined(__AVX512F__)
+constexpr int LANES = 16, VECTORS = 2;  // of 32 registers
+#elif defined(__AVX__)
+constexpr int LANES = 8, VECTORS = 2;  // of 16
+#elif defined(__aarch64__)
+constexpr int LANES = 4, VECTORS = 4;  // of 32
+#else
+constexpr int LANES = 4, VECTORS = 2;  // of 16
+#endif
+constexpr int BLOCK = LANES * VECTORS;
+
+typedef float Vector __attribute__((vector_size(4 * LANES), may_alias));
+using Row = float[BLOCK];
+
+struct alignas(64) Scratch {
+  Row activations[2][WIDEST];
+  Row obs[OBS], target[OBS];
+  Row noise;
+};
+
+// Where one particle's entries are: those of row p of every row.
+struct Column {
+  Row* rows;
+  int p;
+  float& operator[](int i) const { return rows[i][p]; }
+};
+
+// x / (1 + exp(-x)); NaN of -infinity, as by way of tanh.
+float swish(float x) {
+  float twos = x * -1.44269504f;
+  twos = twos < 128.0f ? twos : 128.0f;  // of which the power is infinite
+  twos = twos > -126.0f ? twos : -126.0f;
+  const float shifted = twos + ROUNDER;
+  return x / (1.0f + power_of_two(shifted, twos - (shifted - ROUNDER)));
+}
+
+template <int OUTPUTS, bool IS_HEAD>
+void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
+                   Row* outputs) {
+  Vector sums[OUTPUTS][VECTORS];
+#pragma GCC unroll 8
+  for (int j = 0; j < OUTPUTS; ++j)
+#pragma GCC unroll 8
+    for (int v = 0; v < VECTORS; ++v) sums[j][v] = weights[j] - Vector{};
+  for (int i = 0; i < num_inputs; ++i) {
+    weights += OUTPUTS;
+    Vector input[VECTORS];
+#pragma GCC unroll 8
+    for (int v = 0; v < VECTORS; ++v)
+      input[v] = *reinterpret_cast<const Vector*>(&inputs[i][v * LANES]);
+#pragma GCC unroll 8
+    for (int j = 0; j < OUTPUTS; ++j)
+#pragma GCC unroll 8
+      for (int v = 0; v < VECTORS; ++v) sums[j][v] += weights[j] * input[v];
+  }
+#pragma GCC unroll 8
+  for (int j = 0; j < OUTPUTS; ++j)
+#pragma GCC unroll 8
+    for (int v = 0; v < VECTORS; ++v)
+      *reinterpret_cast<Vector*>(&outputs[j][v * LANES]) = sums[j][v];
+  if (IS_HEAD) return;
+  for (int j = 0; j < OUTPUTS; ++j)
+    for (int p = 0; p < BLOCK; ++p) outputs[j][p] = swish(outputs[j][p]);
+}
+
+// Runs a layer and those after it; returns where the last one's outputs are.
+template <int LAYER = 0>
+const Row* run_layers(const float* weights, Scratch& scratch) {
+  constexpr int FROM = WIDTHS[LAYER], TO = WIDTHS[LAYER + 1];
+  constexpr bool IS_HEAD = LAYER + 2 == NUM_WIDTHS;
+  const Row* inputs = scratch.activations[LAYER % 2];
+  Row* outputs = scratch.activations[(LAYER + 1) % 2];
+  const float* tile = weights;
+  for (int j = 0; j + TILE <= TO; j += TILE, tile += TILE * (FROM + 1))
+    multiply_tile<TILE, IS_HEAD>(tile, inputs, FROM, outputs + j);
+  if constexpr (TO % TILE != 0)
+    multiply_tile<TO % TILE, IS_HEAD>(tile, inputs, FROM, outputs + TO / TILE * TILE);
+  if constexpr (IS_HEAD)
+    return outputs;
+  else
+    return run_layers<LAYER + 1>(weights + layer_weights(LAYER), scratch);
+}
+
+// Writes the network's inputs of a step; `actions` has every particle's first action.
+void read_inputs(const float* const (&actions)[BLOCK], int step, const float* shared,
+                 Scratch& scratch) {
+  Row* inputs = scratch.activations[0];
+#pragma GCC ivdep
+  for (int p = 0; p < BLOCK; ++p) features(Column{scratch.obs, p}, Column{inputs, p});
+  for (int p = 0; p < BLOCK; ++p)
+    for (int i = 0; i < ACTION; ++i)
+      inputs[FEATURES + i][p] = actions[p][step * ACTION + i];
+  for (int i = 0; i < INPUTS; ++i)
+    for (int p = 0; p < BLOCK; ++p) inputs[i][p] = scaled(inputs[i][p], i, shared);
+}
+
+// `counter` is the place of the first particle's first entry in the draw of the step.
+void draw_targets(const Row* head, const uint32_t* key, uint32_t counter,
+                  const float* shared, Scratch& scratch) {
+  for (int i = 0; i < OBS; ++i) {
+    uint32_t bits[BLOCK];
+    threefry(key[0], key[1], counter + i, OBS, bits);
+    normal(bits, scratch.noise);
+    const float min_variance = shared[MIN_VARIANCE + i];
+    const float max_precision = shared[MAX_PRECISION + i];
+    for (int p = 0; p < BLOCK; ++p)
+      scratch.target[i][p] =
+          head[i][p] +
+          scratch.noise[p] * deviation(head[OBS + i][p], min_variance, max_precision);
+  }
+}
+
+void move_all(const float* shared, Scratch& scratch) {
+#pragma GCC ivdep
+  for (int p = 0; p < BLOCK; ++p) {
+    float moved[OBS];
+    next_obs(Column{scratch.obs, p}, Column{scratch.target, p}, moved);
+    bound(moved, shared + LOW, shared + HIGH, Column{scratch.obs, p});
+  }
+}
+
+// The last block of a member may have fewer particles than rows have room for: the room
+// is filled with copies of its last one, which are not stored.
+void run_block(const Rollout& rollout, int member, int first, Scratch& scratch) {
+  const int count = rollout.num_candidates * rollout.particles - first;
+  const int64_t stride = int64_t(rollout.num_members) * rollout.particles * OBS;
+  const float* actions[BLOCK];
+  float* paths[BLOCK];
+  for (int p = 0; p < BLOCK; ++p) {
+    const int particle = first + (p < count ? p : count - 1);
+    const int candidate = particle / rollout.particles;
+    actions[p] = rollout.actions + int64_t(candidate) * rollout.horizon * ACTION;
+    paths[p] = rollout.path + candidate * (rollout.horizon + 1) * stride +
+               (member * rollout.particles + particle % rollout.particles) * OBS;
+    for (int i = 0; i < OBS; ++i) paths[p][i] = scratch.obs[i][p] = rollout.obs[i];
+  }
+  const float* weights = rollout.weights + int64_t(member) * MEMBER_WEIGHTS;
+  for (int step = 0; step < rollout.horizon; ++step) {
+    read_inputs(actions, step, rollout.shared, scratch);
+    const Row* head = run_layers(weights, scratch);
+    const uint32_t* key = rollout.keys + KEY * step;
+    const uint32_t counter = noise_counter(rollout, key, member, first);
+    draw_targets(head, key, counter, rollout.shared, scratch);
+    move_all(rollout.shared, scratch);
+    for (int p = 0; p < BLOCK && p < count; ++p) {
+      paths[p] += stride;
+      for (int i = 0; i < OBS; ++i) paths[p][i] = scratch.obs[i][p];
+    }
+  }
+}
+
+// All blocks of all members and of the whole batch; whoever is free takes the next.
+class Blocks {
+ public:
+  explicit Blocks(const Rollout& rollout)
+      : rollout_(rollout),
+        of_member_((int64_t(rollout.num_candidates) * rollout.particles + BLOCK - 1) /
+                   BLOCK),
+        count_(rollout.batch * rollout.num_members * of_member_) {}
+
+  int64_t count() const { return count_; }
+
+  void work() {
+    std::unique_ptr<Scratch> scratch;
+    int64_t done = 0;
+    for (int64_t i; (i = next_.fetch_add(1)) < count_; ++done) {
+      if (!scratch) scratch.reset(new Scratch);
+      const int64_t member = i / of_member_;
+      run_block(at_batch(rollout_, member / rollout_.num_members),
+                member % rollout_.num_members, i % of_member_ * BLOCK, *scratch);
+    }
+    const std::lock_guard<std::mutex> lock(mutex_);
+    done_ += done;
+    if (done_ == count_) all_done_.notify_all();
+  }
+
+  void wait() {
+    std::unique_lock<std::mutex> lock(mutex_);
+    all_done_.wait(lock, [this] { return done_ == count_; });
+  }
+
+ private:
+  const Rollout rollout_;
+  const int64_t of_member_, count_;
+  std::atomic<int64_t> next_{0};
+  std::mutex mutex_;
+  std::condition_variable all_done_;
+  int64_t done_ = 0;
+};
+
+ffi::Error run(ffi::ThreadPool pool, ffi::AnyBuffer weights, ffi::AnyBuffer shared,
+               ffi::AnyBuffer keys, ffi::AnyBuffer obs, ffi::AnyBuffer actions,
+               ffi::Result<ffi::AnyBuffer> path) {
+  const Problem problem = read(weights, shared, keys, obs, actions, *path);
+  if (!problem.error.empty()) return ffi::Error::InvalidArgument(problem.error);
+  // A helper that starts when all is done finds nothing to do, but must find the blocks.
+  const auto blocks = std::make_shared<Blocks>(problem.rollout);
+  for (int64_t i = 1; i < pool.num_threads() && i < blocks->count(); ++i)
+    pool.Schedule([blocks] { blocks->work(); });
+  blocks->work();
+  blocks->wait();
+  return ffi::Error::Success();
+}
+
+}  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Arg<ffi::AnyBuffer>()
+                                  .Ret<ffi::AnyBuffer>());

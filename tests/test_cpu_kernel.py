@@ -1,0 +1,224 @@
+"""The kernel on CPUs: any width and precision, blocks of particles, many threads."""
+
+import dataclasses
+import functools
+import os
+import platform
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rollouts import CPU, SMALL, Case, needs_cpu, recorded, relative_error, scan
+
+from jaxpets import Precision
+
+pytestmark = needs_cpu
+
+# The most particles of one member that are imagined together: with AVX-512, and
+# otherwise 16 or 8.
+BLOCK = 32
+
+
+@pytest.mark.parametrize(
+    "hidden_sizes", [(1,), (5, 6), (7, 13, 1), (12, 257), (300, 300), (8,) * 9]
+)
+def test_any_width_and_depth_will_do(hidden_sizes):
+    """Of tiles of six outputs: none, whole ones, and what is left beside them."""
+    case = dataclasses.replace(SMALL, hidden_sizes=hidden_sizes)
+    args = case.args()
+    assert relative_error(CPU.run(case)(*args), scan(case)(*args)) <= CPU.rounding
+
+
+def test_observations_and_actions_may_be_wide():
+    """Where a GPU has no room."""
+    case = Case(obs_size=130, action_size=140, hidden_sizes=(9,), horizon=2)
+    args = case.args()
+    assert relative_error(CPU.run(case)(*args), scan(case)(*args)) <= CPU.rounding
+
+
+@pytest.mark.parametrize("precision", Precision)
+def test_every_precision_is_float32(precision):
+    fused, caught = recorded(lambda: SMALL.fused(precision, interpret=False))
+    assert not caught
+    got = jax.jit(fused)(*SMALL.args())
+    np.testing.assert_array_equal(got, CPU.run(SMALL)(*SMALL.args()))
+
+
+def test_hidden_units_may_be_far_from_zero():
+    """Where their swish is a number times nothing, or the number itself."""
+    case = Case(hidden_sizes=(240,), horizon=1, state_margin=None)
+    params, *rest = case.args()
+    layers = params.network.members["params"]
+    bias = jnp.tile(jnp.linspace(-150.0, 150.0, 240), (3, 1))
+    layers = layers | {"layer_0": layers["layer_0"] | {"bias": bias}}
+    network = params.network._replace(members={"params": layers})
+    args = params._replace(network=network), *rest
+    assert relative_error(CPU.run(case)(*args), scan(case)(*args)) <= CPU.rounding
+
+
+# Blocks.
+
+
+@functools.cache
+def many():
+    """Arguments of SMALL with 70 candidates; 140 particles of each member."""
+    params, key, obs, _ = SMALL.args()
+    shape = (70, SMALL.horizon, SMALL.action_size)
+    actions = np.random.default_rng(2).uniform(-1, 1, shape).astype(np.float32)
+    return params, key, obs, jnp.asarray(actions)
+
+
+@pytest.mark.parametrize("num_samples", [1, 3, 4, 5, 8, 15, 16, 17, 31, 32, 33, 48, 70])
+def test_blocks_need_not_be_full(num_samples):
+    """Two particles of each candidate: blocks of 8, 16 and 32, with less and more."""
+    params, key, obs, actions = many()
+    args = params, key, obs, actions[:num_samples]
+    want = jax.jit(SMALL.scan())(*args)
+    assert relative_error(CPU.run(SMALL)(*args), want) <= CPU.rounding
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="has flags of its own")
+@pytest.mark.parametrize(("flag", "width"), [("-mno-avx512f", 25), ("-mno-avx", 26)])
+def test_processors_with_shorter_vectors_have_smaller_blocks(
+    monkeypatch, tmp_path, flag, width
+):
+    """Of 16 and of 8 particles, whatever the processor here can do."""
+    script = tmp_path / "c++"
+    script.write_text(f'#!/bin/sh\nexec {shutil.which("c++")} "$@" {flag}\n')
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    # Another width: the kernel of a model that was met before would not be built.
+    case = dataclasses.replace(SMALL, hidden_sizes=(16, width), num_samples=70)
+    args = case.args()
+    assert relative_error(CPU.run(case)(*args), scan(case)(*args)) <= CPU.rounding
+
+
+@pytest.mark.parametrize("num_members", [1, 2, 17])
+def test_members_have_blocks_of_their_own(num_members):
+    case = dataclasses.replace(SMALL, num_members=num_members, particles=13)
+    args = case.args()  # 52 particles of each
+    assert relative_error(CPU.run(case)(*args), scan(case)(*args)) <= CPU.rounding
+
+
+def test_a_path_is_the_same_wherever_it_is_computed():
+    """At another place in a block, in another block, beside others or beside none."""
+    params, key, obs, actions = many()
+    run = CPU.run(SMALL)
+    silent = params.network._replace(  # the noise depends on the place
+        min_logvar=jnp.full_like(params.network.min_logvar, -jnp.inf),
+        max_logvar=jnp.full_like(params.network.max_logvar, -jnp.inf),
+    )
+    params = params._replace(network=silent)
+    path = run(params, key, obs, actions)
+    assert np.isfinite(path).all()
+    np.testing.assert_array_equal(path[..., 0, :], path[..., 1, :])
+    for shift in (1, 7, 16, BLOCK, 69):
+        moved = jnp.roll(actions, shift, 0)
+        got = run(params, key, obs, moved)
+        np.testing.assert_array_equal(got, jnp.roll(path, shift, 0))
+    for i in (0, 15, 16, 69):
+        got = run(params, key, obs, actions[i : i + 1])
+        np.testing.assert_array_equal(got[0], path[i])
+
+
+def test_noise_of_the_first_member_does_not_depend_on_how_many_follow():
+    """It is counted from the front: a path is that of the first candidates alone."""
+    params, key, obs, actions = many()
+    run = CPU.run(SMALL)
+    path = run(params, key, obs, actions)
+    for count in (1, 7, 16, 33):
+        got = run(params, key, obs, actions[:count])
+        np.testing.assert_array_equal(got[:, :, 0], path[:count, :, 0])
+
+
+def test_what_is_not_finite_stays_in_its_place_of_a_block():
+    params, key, obs, actions = many()
+    run = CPU.run(SMALL)
+    path = run(params, key, obs, actions)
+    for i, number in ((0, np.nan), (9, np.inf), (16, -np.inf), (69, np.nan)):
+        got = run(params, key, obs, actions.at[i, 1].set(number))
+        assert np.isnan(got[i, 2:]).all()
+        np.testing.assert_array_equal(got[i, :2], path[i, :2])
+        np.testing.assert_array_equal(np.delete(got, i, 0), np.delete(path, i, 0))
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("layer", ["layer_0", "layer_1", "layer_2"])
+def test_a_sum_that_is_not_finite_goes_where_it_goes_in_the_scan(layer, number):
+    """The swish of minus infinity is NaN there: minus infinity times nothing."""
+    params, *rest = SMALL.args()
+    layers = params.network.members["params"]
+    bias = layers[layer]["bias"].at[0, 1].set(number)
+    layers = layers | {layer: layers[layer] | {"bias": bias}}
+    network = params.network._replace(members={"params": layers})
+    params = params._replace(network=network)
+    got, want = (f(SMALL)(params, *rest) for f in (CPU.run, scan))
+    np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
+
+
+# Calls.
+
+
+def test_calls_are_equal_to_the_last_bit():
+    args = many()
+    path = CPU.run(SMALL)(*args)
+    for _ in range(20):
+        np.testing.assert_array_equal(CPU.run(SMALL)(*args), path)
+    eager = CPU.fused(SMALL)(*args)
+    np.testing.assert_allclose(eager, path, rtol=1e-5, atol=1e-5)
+
+
+def test_inside_a_loop_it_is_the_same_to_the_last_bit():
+    params, key, obs, actions = many()
+    keys = jax.random.split(key, 4)
+    fused = CPU.fused(SMALL)
+
+    @jax.jit
+    def looped(params, keys):
+        step = lambda _, key: (None, fused(params, key, obs, actions))  # noqa: E731
+        return jax.lax.scan(step, None, keys)[1]
+
+    got = looped(params, keys)
+    for path, one in zip(got, keys, strict=True):
+        np.testing.assert_array_equal(path, CPU.run(SMALL)(params, one, obs, actions))
+
+
+def test_a_batch_shares_the_threads():
+    """Blocks of all members and of the whole batch, with less in each than threads."""
+    params, key, obs, actions = many()
+    starts = obs * jnp.linspace(0.5, 1.5, 50)[:, None]
+    mapped = jax.jit(jax.vmap(CPU.fused(SMALL), (None, None, 0, None)))
+    got = mapped(params, key, starts, actions[:3])
+    for path, start in zip(got, starts, strict=True):
+        np.testing.assert_array_equal(
+            path, CPU.run(SMALL)(params, key, start, actions[:3])
+        )
+
+
+def test_programs_of_many_threads_do_not_wait_for_each_other():
+    """More calls at once than XLA has threads, of two programs."""
+    params, key, obs, actions = many()
+    double = jax.jit(
+        lambda *args: [
+            CPU.fused(SMALL)(*args),
+            CPU.fused(SMALL)(*args[:3], -args[3]),
+        ]
+    )
+    one = CPU.run(SMALL)
+    keys = jax.random.split(key, 40)
+    wanted = [one(params, key, obs, actions) for key in keys]
+    opposite = [one(params, key, obs, -actions) for key in keys]
+
+    def call(i):
+        if i % 2:
+            return [one(params, keys[i], obs, actions)], [wanted[i]]
+        return double(params, keys[i], obs, actions), [wanted[i], opposite[i]]
+
+    with ThreadPoolExecutor(16) as pool:
+        futures = [pool.submit(call, i) for i in range(40)]
+        for future in futures:
+            for got, want in zip(*future.result(timeout=60), strict=True):
+                np.testing.assert_array_equal(got, want)
