@@ -152,7 +152,9 @@ def states(npz: Path, count: int) -> tuple[Array, Array]:
 
 def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> Imagine:
     """Returns the compiled rollout, with the values of what it imagines."""
-    engine, precision = ("kernel", "bf16") if name == "kernel" else ("scan", name)
+    on_cpu = jax.default_backend() == "cpu"
+    own = "f32" if on_cpu else "bf16"  # of the kernel
+    engine, precision = ("kernel", own) if name == "kernel" else ("scan", name)
     rollout = workloads.rollout_fn(size, precision, engine)
     rewards: dict[str, tuple[Any, Any]] = {
         "epistemic": (jaxpets.rewards.epistemic, jaxpets.max_variance(params)),

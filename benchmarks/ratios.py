@@ -53,6 +53,12 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             f"{steps} env steps, MJX batch 16",
             lambda: (env.loop_call(16 * steps), mjx_call(16, steps)),
         ),
+        # Last: it ends where no kernel runs.
+        (
+            "plan f32, scan",
+            "plan f32, kernel",
+            lambda: (f32, plan_call(size, "f32", "cem", "kernel")),
+        ),
     ]
     # Two pairs that compile fast show that it works.
     for first, second, build in pairs[:4:3] if args.tiny else pairs:
@@ -66,9 +72,11 @@ def mjx_call(batch: int, steps: int) -> Call:
     return env.env_call(half_cheetah.half_cheetah(), batch, steps)[0]
 
 
-def plan_call(size: workloads.Size, precision: str, search: str) -> Call:
+def plan_call(
+    size: workloads.Size, precision: str, search: str, engine: str = "scan"
+) -> Call:
     """Returns one action of planning, compiled."""
-    planner = workloads.planner(size, precision, search)
+    planner = workloads.planner(size, precision, search, engine=engine)
     key = jax.random.key(0)
     params = jax.jit(lambda: workloads.plan_params(size, key, "epistemic"))()
     state, obs = planner.init(), workloads.transitions(key, 1).obs[0]

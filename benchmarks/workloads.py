@@ -97,7 +97,8 @@ def rollout_fn(size: Size, precision: str, engine: str = "scan") -> jaxpets.Roll
     """Returns the particle rollout of the ensemble.
 
     Raises:
-      SystemExit: if there can be no kernel: a scan must not be timed in its name.
+      SystemExit: if there can be no kernel: a scan must not be timed in its name, nor
+        float32 in the name of another precision.
     """
     if engine == "scan":
         return jaxpets.particle_rollout(
@@ -105,6 +106,8 @@ def rollout_fn(size: Size, precision: str, engine: str = "scan") -> jaxpets.Roll
             num_members=size.num_members,
             num_particles=size.num_particles,
         )
+    if jax.default_backend() == "cpu" and precision != "f32":
+        raise SystemExit("no kernel to time: that of a CPU is --precision f32 only")
     try:
         with warnings.catch_warnings(action="error"):
             return jaxpets.fused_rollout(

@@ -145,8 +145,8 @@ def _ensemble(
 
 def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.RolloutFn:
     precision = jaxpets.Precision(search.precision)
-    has_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
-    if search.fused and has_kernel.get(jax.default_backend(), False):
+    may_have_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
+    if search.fused and may_have_kernel.get(jax.default_backend(), False):
         return jaxpets.fused_rollout(
             dataclasses.replace(size, precision=precision),
             half_cheetah.model_space(),

@@ -78,10 +78,11 @@ class PlannerNumbers:
     temperature: float = number(1.0, 1e-6, 1e6)
     """mppi: 0.1 follows the few best candidates, 10 averages over all."""
     precision: Literal["f32", "tf32", "bf16"] = "bf16"
-    """Of the matrix products while planning; training always uses tf32 or better."""
+    """Of the matrix products while planning, on CPUs with --planner.no-fused only;
+    training always uses tf32 or better."""
     fused: bool = True
-    """Imagine in one kernel: on CPUs, in float32 whatever the precision, and with bf16
-    on GPUs that can (H100, H200)."""
+    """Imagine in one kernel: on CPUs that have a C++ compiler, in float32 whatever the
+    precision, and with bf16 on GPUs that can (H100, H200)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -293,6 +293,7 @@ def test_a_trace_is_summed_over_the_streams_of_the_gpu():
 def test_where_no_kernel_runs_none_is_timed(monkeypatch):
     device = SimpleNamespace(platform="tpu")
     monkeypatch.setattr(jax, "devices", lambda: [device])
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
     with pytest.raises(SystemExit, match=r"no kernel to time: .* is a tpu, not a"):
         plan.main(["--tiny", "--seeds", "1", "--engine", "kernel"])
 
@@ -304,5 +305,7 @@ def test_on_a_cpu_the_kernel_is_timed_but_not_traced():
     assert hasattr(rollout, "bind")  # and is not the scan
     want = jax.jit(workloads.rollout_fn(size, "f32"))(*args)
     np.testing.assert_allclose(jax.jit(rollout)(*args), want, rtol=1e-5, atol=1e-5)
+    with pytest.raises(SystemExit, match="that of a CPU is --precision f32 only"):
+        plan.main(["--tiny", "--seeds", "1", "--engine", "kernel"])
     with pytest.raises(SystemExit, match="there is no GPU whose programs"):
         trace.main(["--tiny", "--seeds", "1"])

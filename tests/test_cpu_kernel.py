@@ -80,20 +80,34 @@ def test_blocks_need_not_be_full(num_samples):
     assert relative_error(CPU.run(SMALL)(*args), want) <= CPU.rounding
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="has flags of its own")
-@pytest.mark.parametrize(("flag", "width"), [("-mno-avx512f", 25), ("-mno-avx", 26)])
-def test_processors_with_shorter_vectors_have_smaller_blocks(
-    monkeypatch, tmp_path, flag, width
-):
-    """Of 16 and of 8 particles, whatever the processor here can do."""
-    script = tmp_path / "c++"
-    script.write_text(f'#!/bin/sh\nexec {shutil.which("c++")} "$@" {flag}\n')
+def without(instructions, monkeypatch, folder):
+    """Lets the compiler believe in a lesser processor."""
+    script = folder / "c++"
+    script.write_text(
+        f'#!/bin/sh\nexec {shutil.which("c++")} "$@" -mno-{instructions}\n'
+    )
     script.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="has flags of its own")
+def test_processors_with_shorter_vectors_have_smaller_blocks(monkeypatch, tmp_path):
+    without("avx512f", monkeypatch, tmp_path)
     # Another width: the kernel of a model that was met before would not be built.
-    case = dataclasses.replace(SMALL, hidden_sizes=(16, width), num_samples=70)
+    case = dataclasses.replace(SMALL, hidden_sizes=(16, 25), num_samples=70)
     args = case.args()
     assert relative_error(CPU.run(case)(*args), scan(case)(*args)) <= CPU.rounding
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="has flags of its own")
+def test_processors_that_cannot_multiply_and_add_at_once_have_none(
+    monkeypatch, tmp_path
+):
+    without("fma", monkeypatch, tmp_path)
+    case = dataclasses.replace(SMALL, hidden_sizes=(16, 26))
+    text = "fused_rollout runs as a scan: the processor has no fused multiply-add"
+    with pytest.warns(UserWarning, match=text):
+        case.fused(interpret=False)
 
 
 @pytest.mark.parametrize("num_members", [1, 2, 17])

@@ -104,9 +104,9 @@ def test_every_kind_is_a_library_of_its_own(cache, monkeypatch, commands, regist
 def test_a_processor_has_a_library_of_its_own(monkeypatch, commands, registered):
     """Where machines share a folder; the reference is for all of them."""
     target, shared = load("// one", Kind.CPU), load("// one", Kind.REFERENCE)
-    told = build._instructions
+    told = build._processor
     monkeypatch.setattr(
-        build, "_instructions", lambda command: told(command) + "#define __MORE__ 1"
+        build, "_processor", lambda command: told(command) + "#define __MORE__ 1"
     )
     assert load("// one", Kind.CPU) != target
     assert load("// one", Kind.REFERENCE) == shared
@@ -115,12 +115,13 @@ def test_a_processor_has_a_library_of_its_own(monkeypatch, commands, registered)
 
 def test_what_the_processor_can_do_is_what_the_compiler_says():
     command = build._compiler(Kind.CPU)
-    said = build._instructions(command)
+    said = build._processor(command)
     assert "#define __cplusplus" in said
     if platform.machine() == "x86_64":
         # Of the oldest processor of the kind, which has less than any since.
         least = [f.replace("-march=native", "-march=x86-64") for f in command]
-        assert build._instructions(least) != said
+        with pytest.raises(BuildError, match="has no fused multiply-add"):
+            build._processor(least)
 
 
 @pytest.mark.parametrize(
@@ -193,6 +194,16 @@ def test_without_xdg_the_cache_is_in_the_home_folder(monkeypatch, tmp_path):
         else:
             monkeypatch.setenv("XDG_CACHE_HOME", value)
         assert build._cache_folder() == tmp_path / "home" / ".cache" / "jaxpets"
+
+
+def test_without_a_home_folder_it_says_so(monkeypatch, commands):
+    def nobody():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", nobody)
+    with pytest.raises(BuildError, match="no home folder; set XDG_CACHE_HOME"):
+        load("// one", Kind.REFERENCE)
 
 
 def test_many_may_build_at_once(cache, commands, registered):

@@ -97,6 +97,13 @@ def test_angles(call, name, exact, most):
 
 
 @pytest.mark.parametrize("name", ["sine", "cosine"])
+def test_angles_past_counting_turns_have_some_sine(call, name):
+    """A finite state stays finite, as in the scan."""
+    x = np.geomspace(1e6, 3e38, 10_000).astype(np.float32)
+    assert (np.abs(call(name, np.concatenate([x, -x]))) <= 1).all()
+
+
+@pytest.mark.parametrize("name", ["sine", "cosine"])
 def test_angles_that_are_none(call, name):
     assert np.isnan(call(name, NONE)).all()
 

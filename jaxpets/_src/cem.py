@@ -59,8 +59,8 @@ def cem(
         public PETS code did by mistake until November 2018.
       unroll: compile the iterations one after the other and not as a loop. The search
         is the same, its code num_iterations times as long; on a CPU it may need more
-        memory. For rollouts as short as those of `fused_rollout`, beside which the
-        programs that a loop adds on a GPU count.
+        memory. For rollouts as short as those of `fused_rollout` on a GPU, beside
+        which the programs that a loop adds count.
 
     Returns:
       A TrajectoryOptimizer.

@@ -42,13 +42,15 @@ def fused_rollout(
     whatever the precision. On a GPU they read float16 and add up in float32: closer to
     float32 than the scan in bfloat16, but an input of the network, or of one of its
     layers, beyond 65504 is infinite and leads to NaN, which a planner counts as the
-    worst. The kernel is for the first device of `jax.devices()`. Where there can be
-    none the scan runs, and a warning of one line says why:
+    worst. The kernel is for the kind of the first device of `jax.devices()`; on another
+    kind a call fails. Where there can be none the scan runs, in the precision of
+    `config`, and a warning of one line says why:
 
-    - `space` does more than arithmetic on single entries, moving them and summing;
-    - there is no compiler: the kernel is built for the model at the first call, in
-      half a minute on a GPU and in seconds on a CPU, and kept in the user's cache
-      folder;
+    - `space` does more than arithmetic on single entries, moving them and summing, or
+      makes next observations of another size;
+    - there is no compiler (nvcc; c++, g++ or clang++): the kernel is built for the
+      model at the first call, in half a minute on a GPU and in seconds on a CPU, and
+      kept in the user's cache folder;
     - keys are not of JAX's default kind, partitionable threefry;
     - the device is neither a CPU nor a GPU of compute capability 9.0 (H100, H200,
       GH200);
@@ -83,15 +85,14 @@ def fused_rollout(
     device = jax.devices()[0]
     try:
         if device.platform == "cpu" and not interpret:
-            shape = TileShape(*sizes)
-            target = _target(config, space, shape, Kind.CPU)
+            kind, shape = Kind.CPU, TileShape(*sizes)
         else:
-            shape = KernelShape(*sizes)
-            _check_sizes(config, shape)
-            if not interpret:
-                _check_device(device)
             kind = Kind.REFERENCE if interpret else Kind.GPU
-            target = _target(config, space, shape, kind)
+            shape = KernelShape(*sizes)
+            _check_shape(config, shape)
+        if kind is Kind.GPU:
+            _check_device(device)
+        target = _target(config, space, shape, kind)
     except (BuildError, UnsupportedError) as error:
         warnings.warn(f"fused_rollout runs as a scan: {error}.", stacklevel=2)
         return scan
@@ -173,7 +174,7 @@ def _check_result(
         raise UnsupportedError(f"{name} makes {list(shape)} of [{obs_size}]")
 
 
-def _check_sizes(config: EnsembleConfig, shape: KernelShape) -> None:
+def _check_shape(config: EnsembleConfig, shape: KernelShape) -> None:
     """Checks what a GPU's kernel needs and a CPU's does not."""
     if config.precision is not Precision.BF16:
         raise UnsupportedError(f"the precision is {config.precision.value}, not bf16")

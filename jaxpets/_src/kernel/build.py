@@ -8,6 +8,7 @@ import importlib.resources
 import importlib.util
 import os
 import platform
+import re
 import shutil
 import subprocess
 import tempfile
@@ -51,7 +52,7 @@ def load_kernel(model: str, kind: Kind) -> str:
     recipe = [jax.__version__, *compiler]
     if kind is Kind.CPU:
         # A folder that machines share has a library for every kind of processor.
-        recipe.append(_instructions(compiler))
+        recipe.append(_processor(compiler))
     folder = importlib.resources.files("jaxpets._src.kernel")
     sources = {name: (folder / name).read_text() for name in _SOURCES}
     sources["model.h"] = model
@@ -106,7 +107,10 @@ def _run(command: list[str]) -> str:
 
 
 def _cache_folder() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError as error:
+        raise BuildError("there is no home folder; set XDG_CACHE_HOME") from error
     return Path(home) / "jaxpets"
 
 
@@ -129,13 +133,17 @@ def _host_compiler() -> list[str]:
     raise BuildError("no C++ compiler found (c++, g++ or clang++)")
 
 
-def _instructions(compiler: list[str]) -> str:
+def _processor(compiler: list[str]) -> str:
     """Returns what the compiler defines for this processor.
 
     Raises:
-      BuildError: if it does not know the processor.
+      BuildError: if it does not know the processor, or that cannot multiply and add at
+        once, without which every step of a polynomial is a call.
     """
-    return _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull])
+    defined = _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull])
+    if not re.search(r"\b(__FMA__|__ARM_FEATURE_FMA)\b", defined):
+        raise BuildError("the processor has no fused multiply-add")
+    return defined
 
 
 def _nvcc() -> list[str]:

@@ -1,4 +1,4 @@
-// The rollout as an XLA custom call. Included last, after `launch` is declared.
+// The rollout as an XLA custom call. Included after the layout of the weights.
 #pragma once
 
 #include <string>

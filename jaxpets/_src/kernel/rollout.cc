@@ -2,14 +2,16 @@
 //
 // A block is a few particles of one member, imagined for all H steps by one core. Entry
 // i of all its particles is one row of BLOCK numbers: what is done to a particle is a
-// loop over a row, which the compiler turns into vector instructions. A block's
-// activations stay in the core's first cache and a member's weights in its second.
-// Nothing but the path is written to memory, and cores meet only at the end.
+// loop over a row, which the compiler turns into vector instructions. The inputs of a
+// layer stay in the core's first cache, the weights of a member, half a megabyte at the
+// paper's size, in its second. Nothing but the path is written to memory, and cores meet
+// only at the end.
 
 #include <atomic>
 #include <condition_variable>
 #include <memory>
 #include <mutex>
+#include <new>
 
 #include "tiles.h"
 // The layout comes first.
@@ -21,12 +23,10 @@ namespace {
 // inputs and one weight.
 #if defined(__AVX512F__)
 constexpr int LANES = 16, VECTORS = 2;  // of 32 registers
-#elif defined(__AVX__)
-constexpr int LANES = 8, VECTORS = 2;  // of 16
 #elif defined(__aarch64__)
 constexpr int LANES = 4, VECTORS = 4;  // of 32
 #else
-constexpr int LANES = 4, VECTORS = 2;  // of 16
+constexpr int LANES = 8, VECTORS = 2;  // of 16
 #endif
 constexpr int BLOCK = LANES * VECTORS;
 
@@ -62,7 +62,7 @@ void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
 #pragma GCC unroll 8
   for (int j = 0; j < OUTPUTS; ++j)
 #pragma GCC unroll 8
-    for (int v = 0; v < VECTORS; ++v) sums[j][v] = weights[j] - Vector{};
+    for (int v = 0; v < VECTORS; ++v) sums[j][v] = weights[j] - Vector{};  // to all
   for (int i = 0; i < num_inputs; ++i) {
     weights += OUTPUTS;
     Vector input[VECTORS];
@@ -106,7 +106,7 @@ const Row* run_layers(const float* weights, Scratch& scratch) {
 void read_inputs(const float* const (&actions)[BLOCK], int step, const float* shared,
                  Scratch& scratch) {
   Row* inputs = scratch.activations[0];
-#pragma GCC ivdep
+#pragma GCC ivdep  // a particle reads and writes its own columns only
   for (int p = 0; p < BLOCK; ++p) features(Column{scratch.obs, p}, Column{inputs, p});
   for (int p = 0; p < BLOCK; ++p)
     for (int i = 0; i < ACTION; ++i)
@@ -132,7 +132,7 @@ void draw_targets(const Row* head, const uint32_t* key, uint32_t counter,
 }
 
 void move_all(const float* shared, Scratch& scratch) {
-#pragma GCC ivdep
+#pragma GCC ivdep  // as above
   for (int p = 0; p < BLOCK; ++p) {
     float moved[OBS];
     next_obs(Column{scratch.obs, p}, Column{scratch.target, p}, moved);
@@ -140,8 +140,8 @@ void move_all(const float* shared, Scratch& scratch) {
   }
 }
 
-// The last block of a member may have fewer particles than rows have room for: the room
-// is filled with copies of its last one, which are not stored.
+// The last block of a member may have fewer particles than rows have room for: the rest
+// of a row imagines the actions of the last one, and is not stored.
 void run_block(const Rollout& rollout, int member, int first, Scratch& scratch) {
   const int count = rollout.num_candidates * rollout.particles - first;
   const int64_t stride = int64_t(rollout.num_members) * rollout.particles * OBS;
@@ -181,14 +181,12 @@ class Blocks {
 
   int64_t count() const { return count_; }
 
-  void work() {
-    std::unique_ptr<Scratch> scratch;
+  void work(Scratch& scratch) {
     int64_t done = 0;
     for (int64_t i; (i = next_.fetch_add(1)) < count_; ++done) {
-      if (!scratch) scratch.reset(new Scratch);
       const int64_t member = i / of_member_;
       run_block(at_batch(rollout_, member / rollout_.num_members),
-                member % rollout_.num_members, i % of_member_ * BLOCK, *scratch);
+                member % rollout_.num_members, i % of_member_ * BLOCK, scratch);
     }
     const std::lock_guard<std::mutex> lock(mutex_);
     done_ += done;
@@ -214,11 +212,16 @@ ffi::Error run(ffi::ThreadPool pool, ffi::AnyBuffer weights, ffi::AnyBuffer shar
                ffi::Result<ffi::AnyBuffer> path) {
   const Problem problem = read(weights, shared, keys, obs, actions, *path);
   if (!problem.error.empty()) return ffi::Error::InvalidArgument(problem.error);
+  const std::unique_ptr<Scratch> own(new (std::nothrow) Scratch);
+  if (!own) return ffi::Error(ffi::ErrorCode::kResourceExhausted, "out of memory");
   // A helper that starts when all is done finds nothing to do, but must find the blocks.
   const auto blocks = std::make_shared<Blocks>(problem.rollout);
   for (int64_t i = 1; i < pool.num_threads() && i < blocks->count(); ++i)
-    pool.Schedule([blocks] { blocks->work(); });
-  blocks->work();
+    pool.Schedule([blocks] {
+      const std::unique_ptr<Scratch> scratch(new (std::nothrow) Scratch);
+      if (scratch) blocks->work(*scratch);
+    });
+  blocks->work(*own);
   blocks->wait();
   return ffi::Error::Success();
 }

@@ -1,9 +1,10 @@
 """A function of one row of numbers, written as JAX, written out as C++.
 
-The rollout kernel steps one particle per thread. The coordinates of a model, its
-ModelSpace, are JAX functions; this turns their jaxprs into straight-line code over
-named scalars. What moves numbers around (slice, concatenate, reshape, indexing) costs
-nothing: it only says which name stands where.
+A rollout kernel steps particles one by one: on a GPU one per thread, on a CPU one per
+lane of a vector. The coordinates of a model, its ModelSpace, are JAX functions; this
+turns their jaxprs into straight-line code over named scalars. What moves numbers around
+(slice, concatenate, reshape, indexing) costs nothing: it only says which name stands
+where.
 """
 
 import math
@@ -92,7 +93,8 @@ def row_function(
     """Returns C++ for a function of float32 vectors that returns one vector.
 
     Args:
-      name: of the C++ function; its arguments are those of `function`, then `out`.
+      name: of the C++ function; its arguments are those of `function`, then `out`,
+        which must be none of them: it is written before all of them are read.
       function: JAX code, traceable.
       sizes: name and length of each argument.
 

@@ -1,4 +1,4 @@
-"""The sizes of one rollout kernel, and its parameters laid out as it reads them."""
+"""The sizes of one GPU kernel, and its parameters laid out as it reads them."""
 
 import dataclasses
 import math
@@ -19,7 +19,7 @@ _HALF_MAX = 65504.0
 
 @dataclasses.dataclass(frozen=True)
 class KernelShape:
-    """What is fixed when a kernel is compiled. Widths are those of the model.
+    """What is fixed when a GPU's kernel is compiled. Widths are those of the model.
 
     Attributes:
       obs_size: D.
