@@ -2,6 +2,7 @@
 #pragma once
 
 #include <string>
+#include <utility>
 
 #include "rollout.h"
 #include "xla/ffi/api/ffi.h"
@@ -16,8 +17,8 @@ int64_t product(ffi::AnyBuffer::Dimensions dims, size_t first, size_t last) {
   return result;
 }
 
-// Elements to move along axis `axis` of an operand whose own shape has `rank` axes.
-int64_t batch_stride(const ffi::AnyBuffer& operand, size_t rank, size_t axis) {
+// Elements to move along axis `axis` of an operand.
+int64_t batch_stride(const ffi::AnyBuffer& operand, size_t axis) {
   const auto dims = operand.dimensions();
   return dims[axis] == 1 ? 0 : product(dims, axis + 1, dims.size());
 }
@@ -63,13 +64,25 @@ Problem read(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer keys,
       continue;
     }
     out.size = dims[axis];
-    out.weights = batch_stride(weights, 2, axis);
-    out.shared = batch_stride(shared, 1, axis);
-    out.keys = batch_stride(keys, 2, axis);
-    out.obs = batch_stride(obs, 1, axis);
-    out.actions = batch_stride(actions, 3, axis);
+    out.weights = batch_stride(weights, axis);
+    out.shared = batch_stride(shared, axis);
+    out.keys = batch_stride(keys, axis);
+    out.obs = batch_stride(obs, axis);
+    out.actions = batch_stride(actions, axis);
   }
   return {rollout, ""};
+}
+
+// What every `run` takes after its contexts: the operands as `read` has them.
+template <class Binding>
+auto with_operands(Binding binding) {
+  return std::move(binding)
+      .template Arg<ffi::AnyBuffer>()
+      .template Arg<ffi::AnyBuffer>()
+      .template Arg<ffi::AnyBuffer>()
+      .template Arg<ffi::AnyBuffer>()
+      .template Arg<ffi::AnyBuffer>()
+      .template Ret<ffi::AnyBuffer>();
 }
 
 }  // namespace

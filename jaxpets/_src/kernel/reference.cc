@@ -46,9 +46,8 @@ std::vector<Half> activate(const std::vector<float>& sums) {
 
 void run_particle(const Rollout& rollout, int member, int particle) {
   const int candidate = particle / rollout.particles;
-  const int64_t stride = int64_t(rollout.num_members) * rollout.particles * OBS;
-  float* path = rollout.path + candidate * (rollout.horizon + 1) * stride +
-                (member * rollout.particles + particle % rollout.particles) * OBS;
+  const int64_t stride = path_stride(rollout);
+  float* path = path_of(rollout, member, particle);
   float obs[OBS];
   for (int i = 0; i < OBS; ++i) path[i] = obs[i] = rollout.obs[i];
   for (int step = 0; step < rollout.horizon; ++step) {
@@ -100,10 +99,4 @@ ffi::Error run(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer key
 }  // namespace
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
-                              ffi::Ffi::Bind()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Ret<ffi::AnyBuffer>());
+                              with_operands(ffi::Ffi::Bind()));

@@ -36,7 +36,6 @@ using Row = float[BLOCK];
 struct alignas(64) Scratch {
   Row activations[2][WIDEST];
   Row obs[OBS], target[OBS];
-  Row noise;
 };
 
 // Where one particle's entries are: those of row p of every row.
@@ -120,14 +119,15 @@ void draw_targets(const Row* head, const uint32_t* key, uint32_t counter,
                   const float* shared, Scratch& scratch) {
   for (int i = 0; i < OBS; ++i) {
     uint32_t bits[BLOCK];
+    Row noise;
     threefry(key[0], key[1], counter + i, OBS, bits);
-    normal(bits, scratch.noise);
+    normal(bits, noise);
     const float min_variance = shared[MIN_VARIANCE + i];
     const float max_precision = shared[MAX_PRECISION + i];
     for (int p = 0; p < BLOCK; ++p)
       scratch.target[i][p] =
           head[i][p] +
-          scratch.noise[p] * deviation(head[OBS + i][p], min_variance, max_precision);
+          noise[p] * deviation(head[OBS + i][p], min_variance, max_precision);
   }
 }
 
@@ -144,15 +144,14 @@ void move_all(const float* shared, Scratch& scratch) {
 // of a row imagines the actions of the last one, and is not stored.
 void run_block(const Rollout& rollout, int member, int first, Scratch& scratch) {
   const int count = rollout.num_candidates * rollout.particles - first;
-  const int64_t stride = int64_t(rollout.num_members) * rollout.particles * OBS;
+  const int64_t stride = path_stride(rollout);
   const float* actions[BLOCK];
   float* paths[BLOCK];
   for (int p = 0; p < BLOCK; ++p) {
     const int particle = first + (p < count ? p : count - 1);
     const int candidate = particle / rollout.particles;
     actions[p] = rollout.actions + int64_t(candidate) * rollout.horizon * ACTION;
-    paths[p] = rollout.path + candidate * (rollout.horizon + 1) * stride +
-               (member * rollout.particles + particle % rollout.particles) * OBS;
+    paths[p] = path_of(rollout, member, particle);
     for (int i = 0; i < OBS; ++i) paths[p][i] = scratch.obs[i][p] = rollout.obs[i];
   }
   const float* weights = rollout.weights + int64_t(member) * MEMBER_WEIGHTS;
@@ -229,11 +228,4 @@ ffi::Error run(ffi::ThreadPool pool, ffi::AnyBuffer weights, ffi::AnyBuffer shar
 }  // namespace
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
-                              ffi::Ffi::Bind()
-                                  .Ctx<ffi::ThreadPool>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Ret<ffi::AnyBuffer>());
+                              with_operands(ffi::Ffi::Bind().Ctx<ffi::ThreadPool>()));

@@ -628,13 +628,7 @@ ffi::Error run(cudaStream_t stream, ffi::AnyBuffer weights,
 }  // namespace
 
 // The stream is only launched on, so XLA may record the call in a CUDA graph.
-XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
-                              ffi::Ffi::Bind()
-                                  .Ctx<ffi::PlatformStream<cudaStream_t>>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Arg<ffi::AnyBuffer>()
-                                  .Ret<ffi::AnyBuffer>(),
-                              {ffi::Traits::kCmdBufferCompatible});
+XLA_FFI_DEFINE_HANDLER_SYMBOL(
+    jaxpets_rollout, run,
+    with_operands(ffi::Ffi::Bind().Ctx<ffi::PlatformStream<cudaStream_t>>()),
+    {ffi::Traits::kCmdBufferCompatible});

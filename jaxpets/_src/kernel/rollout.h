@@ -40,9 +40,14 @@ struct Rollout {
   BatchAxis axes[MAX_BATCH_AXES];
 };
 
+// How far the steps of a particle's path lie apart.
+ROW_FUNCTION int64_t path_stride(const Rollout& rollout) {
+  return int64_t(rollout.num_members) * rollout.particles * OBS;
+}
+
 ROW_FUNCTION Rollout at_batch(Rollout rollout, int64_t index) {
-  rollout.path += index * rollout.num_candidates * (rollout.horizon + 1) *
-                  rollout.num_members * rollout.particles * OBS;
+  rollout.path +=
+      index * rollout.num_candidates * (rollout.horizon + 1) * path_stride(rollout);
   for (int axis = MAX_BATCH_AXES - 1; axis >= 0; --axis) {
     const BatchAxis& a = rollout.axes[axis];
     const int64_t i = index % a.size;
@@ -68,6 +73,13 @@ ROW_FUNCTION void move(float (&obs)[OBS], const float (&target)[OBS],
 
 ROW_FUNCTION float scaled(float input, int index, const float* shared) {
   return (input - shared[INPUT_MEAN + index]) * shared[INPUT_SCALE + index];
+}
+
+// Where a particle's path begins.
+ROW_FUNCTION float* path_of(const Rollout& rollout, int member, int particle) {
+  const int candidate = particle / rollout.particles;
+  return rollout.path + candidate * (rollout.horizon + 1) * path_stride(rollout) +
+         (member * rollout.particles + particle % rollout.particles) * OBS;
 }
 
 // The place of a particle's first entry in the draw of `[E, N, P, OBS]`.
