@@ -96,9 +96,11 @@ def test_what_cannot_be_written_as_rows_is_the_scan(engine, function, words):
 NEVER = dataclasses.replace(SMALL, hidden_sizes=(40,))  # never built
 
 
-def compiler(folder, script):
-    """A compiler that knows the processor, which is asked first, and then does this."""
-    knows = 'case "$*" in *-dM*) echo "#define __FMA__ 1"; exit;; esac'
+KNOWS = 'case "$*" in *-dM*) echo "#define __FMA__ 1"; exit;; esac'
+
+
+def compiler(folder, script, knows=KNOWS):
+    """A compiler that is asked what it knows of the processor, and then does this."""
     path = folder / "c++"
     path.write_text(f"#!/bin/sh\n{knows}\n{script}\n")
     path.chmod(0o755)
@@ -121,9 +123,8 @@ def test_with_a_compiler_that_fails_it_is_the_scan(engine, monkeypatch, tmp_path
 def test_with_a_processor_that_the_compiler_does_not_know_it_is_the_scan(
     monkeypatch, tmp_path
 ):
-    compiler(
-        tmp_path, "echo \"c++: error: bad value 'native' for '-march='\" >&2; exit 1"
-    )
+    knows = "echo \"c++: error: bad value 'native' for '-march='\" >&2; exit 1"
+    compiler(tmp_path, "echo 'it was asked to build' >&2; exit 1", knows)
     monkeypatch.setenv("PATH", str(tmp_path))
     words = "c++ failed: c++: error: bad value 'native' for '-march='"
     assert_is_the_scan(NEVER, words, interpret=False)
