@@ -122,12 +122,7 @@ def _explored(
     if found is None:
         raise SystemExit(f"there is no checkpoint in {folder}")
     params = jax.tree.map(lambda x: x[0], found[1].params)
-    size = dataclasses.replace(
-        search,
-        num_members=num_members,
-        hidden_sizes=(config.model.hidden_size,) * config.model.num_layers,
-    )
-    return params, size
+    return params, workloads.with_network(search, config.model)
 
 
 def states(npz: Path, count: int) -> tuple[Array, Array]:

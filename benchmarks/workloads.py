@@ -49,13 +49,21 @@ def named_size(name: str) -> Size:
     from experiments.presets import PRESETS  # needs the extra `experiments`
 
     numbers = PRESETS["laptop"]
-    planner, network = numbers.planner, numbers.model
-    return Size(
+    planner = numbers.planner
+    search = Size(
         num_samples=planner.num_samples,
         num_elites=planner.num_elites,
         num_iterations=planner.num_iterations,
         horizon=planner.horizon,
         num_particles=planner.num_particles,
+    )
+    return with_network(search, numbers.model)
+
+
+def with_network(size: Size, network: Any) -> Size:
+    """Returns the size with the network of an experiment, its `ModelNumbers`."""
+    return dataclasses.replace(
+        size,
         num_members=network.num_members,
         hidden_sizes=(network.hidden_size,) * network.num_layers,
     )
