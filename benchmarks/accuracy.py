@@ -25,10 +25,11 @@ from jax import Array
 
 import jaxpets
 from benchmarks import rows, workloads
-from experiments import checkpoint, cli, phases, rundir
+from experiments import cli, phases
 from experiments.build import build
 from experiments.errors import RunError
 from experiments.presets import PRESETS
+from experiments.storage import checkpoint, rundir
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (

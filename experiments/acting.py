@@ -10,8 +10,8 @@ from jax import Array
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
-from experiments import devices
-from experiments.devices import AXES, SEED, TASK, Spread
+from experiments.parallel import devices
+from experiments.parallel.devices import AXES, SEED, TASK, Spread
 from jaxpets.envs import half_cheetah
 
 # Called between chunks with the environment steps done; may raise to stop the run.

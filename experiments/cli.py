@@ -12,13 +12,13 @@ from typing import Any, get_args
 
 import tyro
 
-from experiments import rundir
 from experiments.config import Config, TaskName, ranges, validate
 from experiments.errors import CheckpointError, UsageError
-from experiments.hosts import Place
+from experiments.parallel.distributed import Place
 from experiments.presets import PRESETS, numbers_of
+from experiments.storage import rundir
 
-# Explored models that come with the code; see `experiments.pretrained`.
+# Explored models that come with the code; see `experiments.tools.pretrained`.
 PRETRAINED = Path(__file__).parents[1] / "results" / "pretrained"
 # What belongs to a process and not to its run.
 _PLACE = Place._fields

@@ -10,12 +10,14 @@ import jax
 from jax import Array
 from jax.sharding import PartitionSpec as P
 
-from experiments import acting, checkpoint, devices, hosts, records, rundir
+from experiments import acting, records
 from experiments.acting import Tick, Trials
 from experiments.build import LEARNER_AXES, Learn, State, over_seeds
 from experiments.config import Config
-from experiments.devices import Spread
+from experiments.parallel import devices, distributed
+from experiments.parallel.devices import Spread
 from experiments.progress import Progress
+from experiments.storage import checkpoint, rundir
 
 Say = Callable[[str], None]
 
@@ -42,7 +44,7 @@ def run(
     spread, axes = loop.spread, loop.axes
     found = restore(checkpoints, init, say)
     done, state, meta = found or (first, init, {"log": 0})
-    hosts.on_first(lambda: rundir.cut_log(log, meta["log"]))
+    distributed.on_first(lambda: rundir.cut_log(log, meta["log"]))
     if done >= last:
         say(f"already complete: {last - first} of {last - first} trials.")
         return None
@@ -65,7 +67,7 @@ def run(
             whole, fit = devices.collect(spread, (state, fit), *axes)
             rows = records.rows(loop.labels(trial), trials, fit, whole.params)
             timed = [{**row, "seconds": seconds} for row in rows]
-            hosts.on_first(
+            distributed.on_first(
                 functools.partial(_write, folder, trial, timed, whole, config)
             )
             text = f"{loop.what} {trial}/{last}  {records.describe(rows)}"
@@ -103,10 +105,10 @@ def restore(
         kept.append(state)
         return number, meta
 
-    found = hosts.on_first(read)
+    found = distributed.on_first(read)
     if found is None:
         return None
-    return found[0], hosts.share(kept[0] if kept else None, template), found[1]
+    return found[0], distributed.share(kept[0] if kept else None, template), found[1]
 
 
 def learner(spread: Spread, learn: Learn, *axes: str) -> Learn:

@@ -14,16 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import (
-    acting,
-    checkpoint,
-    coverage,
-    devices,
-    hosts,
-    loop,
-    records,
-    rundir,
-)
+from experiments import acting, loop, records
 from experiments.acting import Tick, Trials
 from experiments.build import (
     EXPLORE,
@@ -36,10 +27,13 @@ from experiments.build import (
     trial_keys,
 )
 from experiments.config import Config
-from experiments.devices import SEED, TASK, Spread
 from experiments.loop import Loop, Say
+from experiments.parallel import devices, distributed
+from experiments.parallel.devices import SEED, TASK, Spread
 from experiments.progress import Progress
 from experiments.refit import refit
+from experiments.report import coverage
+from experiments.storage import checkpoint, rundir
 from jaxpets.envs import half_cheetah
 
 
@@ -78,7 +72,7 @@ def explore(config: Config, folder: Path, say: Say) -> None:
     trials = loop.run(config, folder, own, init, 0, config.num_trials, say)
     data = data_of(explored_template(config, parts))
     last, anew = config.num_trials, trials is not None
-    hosts.on_first(
+    distributed.on_first(
         lambda: coverage.write(folder, config.seeds, data, last, anew=anew, warn=say)
     )
 
@@ -89,7 +83,7 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
     The jump-start of Table 1. The model that performs is saved beside its log.
     """
     log = folder / "metrics.jsonl"
-    if hosts.on_first(lambda: rundir.log_size(log)):  # written once, at the end
+    if distributed.on_first(lambda: rundir.log_size(log)):  # written once, at the end
         say(f"already complete: {config.eval_trials} of {config.eval_trials} trials.")
         return
     parts = build(config)
@@ -121,8 +115,8 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
     ]
     rows = records.rows(labels, trials)
     paths = folder / "trajectories.npz"
-    hosts.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
-    hosts.on_first(lambda: rundir.append_rows(log, rows))
+    distributed.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
+    distributed.on_first(lambda: rundir.append_rows(log, rows))
     say(_summary(rows, names, f"{time.monotonic() - begin:.0f} s"))
 
 
@@ -159,7 +153,7 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
     learn = loop.learner(spread, parts.finetuner.learn, SEED, TASK)
     keys = lambda trial: _fan(trial_keys(config, FINETUNE, trial), _task_ids(names))  # noqa: E731
     explored = _explored(config, source, step, parts, say)
-    begun = hosts.on_first(lambda: bool(checkpoint.steps(folder / "checkpoints")))
+    begun = distributed.on_first(lambda: bool(checkpoint.steps(folder / "checkpoints")))
     if parts.refitter and not begun:
         explored = refit(config, parts.refitter, explored, step, say)
     capacity = explored.dataset.data.obs.shape[1]
@@ -172,7 +166,9 @@ def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) ->
     if trials is not None:
         trials = jax.tree.map(lambda x: x[:, :, None], trials)
         paths = folder / "trajectories.npz"
-        hosts.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
+        distributed.on_first(
+            lambda: records.save_paths(paths, trials, config.seeds, names)
+        )
 
 
 def _performing(
@@ -188,7 +184,9 @@ def _performing(
     if fitter:
         state = refit(config, fitter, state, step, say)
     model = model_of(state)
-    hosts.on_first(lambda: checkpoint.save(checkpoints, step, model, {}, finite=model))
+    distributed.on_first(
+        lambda: checkpoint.save(checkpoints, step, model, {}, finite=model)
+    )
     return model
 
 

@@ -9,8 +9,8 @@ from types import FrameType
 
 import tqdm
 
-from experiments import hosts
 from experiments.errors import InterruptedRun
+from experiments.parallel import distributed
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # A log file gets a line per trial, no bar.
@@ -56,7 +56,7 @@ class Progress:
     """A bar over environment steps, lines per trial, and the wish to stop."""
 
     def __init__(self, total: int, done: int, what: str) -> None:
-        self._shown = hosts.is_first()
+        self._shown = distributed.is_first()
         self._bar = tqdm.tqdm(
             total=total,
             initial=done,
@@ -80,7 +80,7 @@ class Progress:
         """
         self._done += steps
         self._bar.update(steps)
-        if number := hosts.agree(self._stop):
+        if number := distributed.agree(self._stop):
             raise InterruptedRun(signal.Signals(number).name)
 
     def line(self, text: str) -> None:

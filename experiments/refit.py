@@ -11,11 +11,12 @@ import jax
 from jax import Array
 
 import jaxpets
-from experiments import devices, loop
+from experiments import loop
 from experiments.build import REFIT, State, trial_keys
 from experiments.config import Config
-from experiments.devices import SEED
 from experiments.loop import Say
+from experiments.parallel import devices
+from experiments.parallel.devices import SEED
 
 
 def refit(

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from experiments import cli, hosts, session
+from experiments import cli, session
 from experiments.config import NUM_TASKS, Config, PlannerNumbers
 from experiments.errors import (
     CheckpointError,
@@ -17,6 +17,7 @@ from experiments.errors import (
     StorageError,
     UsageError,
 )
+from experiments.parallel import distributed
 from experiments.presets import PRESETS
 from experiments.progress import stoppable
 
@@ -31,8 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-        with hosts.joined(cli.place(arguments), _say):
-            plain = hosts.on_first(lambda: cli.to_json(cli.parse(arguments)))
+        with distributed.joined(cli.place(arguments), _say):
+            plain = distributed.on_first(lambda: cli.to_json(cli.parse(arguments)))
             config = cli.from_json(plain, PRESETS["smoke"])
             with _plain_errors(config):
                 _dispatch(config)
@@ -47,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _dispatch(config: Config) -> None:
     if config.phase == "report":
-        from experiments import report
+        from experiments.report import report
 
         for path in report.write_report(config.out, config.out / "report"):
             _say(f"wrote {path}")
@@ -57,14 +58,14 @@ def _dispatch(config: Config) -> None:
     if config.phase == "explore":
         _explore(config, source)
         return
-    step = hosts.on_first(lambda: _explored_step(config, source))
+    step = distributed.on_first(lambda: _explored_step(config, source))
     folder = cli.results_folder(config) / _attempt(config, step)
     with _without_gl(), stoppable(), _opened(config, folder):
         from experiments import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
         phase(config, source, folder, step, _say)
-    if config.video is not None and hosts.is_first():
+    if config.video is not None and distributed.is_first():
         _video(config, folder)
 
 
@@ -86,12 +87,12 @@ def _explore(config: Config, folder: Path) -> None:
 def _opened(config: Config, folder: Path) -> AbstractContextManager[None]:
     """Returns what holds a run's folder, on the process that has one."""
     run = session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say)
-    return hosts.held_by_first(run)
+    return distributed.held_by_first(run)
 
 
 def _explored_step(config: Config, source: Path) -> int:
     """Returns the trial whose checkpoint phase 2 starts from."""
-    from experiments import checkpoint
+    from experiments.storage import checkpoint
 
     steps = checkpoint.steps(source / "checkpoints")
     if not steps:
@@ -105,7 +106,7 @@ def _explored_step(config: Config, source: Path) -> int:
 
 def _video(config: Config, folder: Path) -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
-    from experiments import video
+    from experiments.tools import video
     from jaxpets.envs.half_cheetah import TASK_NAMES
 
     assert config.video is not None
@@ -217,7 +218,7 @@ def _planned_steps(config: Config) -> int:
 
 
 def _say(text: str) -> None:
-    if hosts.is_first():
+    if distributed.is_first():
         print(text, file=sys.stderr, flush=True)
 
 

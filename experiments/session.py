@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import cli, rundir
+from experiments import cli
 from experiments.config import NUM_TASKS
 from experiments.errors import CheckpointError, InterruptedRun, RunError
 from experiments.presets import PRESETS
+from experiments.storage import rundir
 
 # Two checkpoints and one being written, of a paper-sized run of one seed and task.
 _NEEDED_BYTES = 64 * 2**20

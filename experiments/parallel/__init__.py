@@ -1,0 +1,1 @@
+"""Seeds, tasks and trials over the devices of a host, and over hosts."""

@@ -1,0 +1,168 @@
+"""A run on several hosts: processes that join, and the little they tell each other.
+
+Process 0 has the run's folder and the screen. What it reads, decides or fails at gets
+to the others through here, so that all of them go on, stop or end together.
+"""
+
+import atexit
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+
+from experiments import errors
+from experiments.errors import OutOfMemoryError, RunError, UsageError
+from experiments.storage.pytrees import describe, from_host, to_host
+
+
+class Place(NamedTuple):
+    """This process among the others; None is for jax to find out."""
+
+    coordinator_address: str | None
+    num_processes: int | None
+    process_id: int | None
+
+
+@contextlib.contextmanager
+def joined(place: Place | None, say: Callable[[str], None]) -> Iterator[None]:
+    """Makes this process one of several for a while; None leaves it alone.
+
+    Raises:
+      UsageError: if jax cannot tell where the others are. If they are not there within
+        five minutes, it ends the process.
+    """
+    if place is None:
+        yield
+        return
+    say("waiting for the other processes, at most 5 minutes.")
+    # It would catch SIGTERM, which is a run's own to handle.
+    jax.config.update("jax_enable_preemption_service", False)
+    # A cluster is asked for the place only: it would also give us one device of many.
+    detect = "deactivate" if place.coordinator_address else None
+    try:
+        jax.distributed.initialize(*place, cluster_detection_method=detect)
+    except (RuntimeError, ValueError) as error:
+        why = str(error).partition("\n")[0].rstrip(".")
+        raise UsageError(
+            f"cannot join the other processes ({why}). Check --coordinator-address, "
+            "--num-processes and --process-id on every host."
+        ) from error
+    try:
+        yield
+    except BaseException as error:
+        if not isinstance(error, RunError) or isinstance(error, OutOfMemoryError):
+            # The others know nothing of it and wait for us: jax ends them once we are
+            # gone, but at exit it would wait for them first.
+            atexit.register(os._exit, getattr(error, "exit_code", 1))
+            raise
+        _leave()
+        raise
+    _leave()
+
+
+def _leave() -> None:
+    agree(0)  # process 0 may have been busy for longer than a shutdown waits
+    jax.distributed.shutdown()
+
+
+def is_first() -> bool:
+    """Returns whether this process has the run's folder and the screen."""
+    return _alone() or jax.process_index() == 0
+
+
+def on_first(call: Callable[[], Any]) -> Any:
+    """Calls on process 0 only; all processes get the JSON value or the RunError."""
+    if _alone():
+        return call()
+    answer, failure = {}, None
+    if is_first():
+        try:
+            answer = {"value": call()}
+        except Exception as error:
+            failure = error
+            kind = error if isinstance(error, RunError) else RunError()
+            words = str(error) or type(error).__name__
+            answer = {"kind": type(kind).__name__, "words": words}
+    data = np.frombuffer(json.dumps(answer).encode(), np.uint8)
+    size = int(_from_first(np.array([data.size], np.int32))[0])
+    data = _from_first(data if is_first() else np.zeros(size, np.uint8))
+    answer = json.loads(data.tobytes())
+    if failure is not None:
+        raise failure
+    if "kind" in answer:
+        raise getattr(errors, answer["kind"])(answer["words"])
+    return answer["value"]
+
+
+@contextlib.contextmanager
+def held_by_first(manager: contextlib.AbstractContextManager[None]) -> Iterator[None]:
+    """Enters a context on process 0 only, for all of them."""
+    with contextlib.ExitStack() as stack:
+        on_first(lambda: stack.enter_context(manager))
+        yield
+
+
+def share(state: Any, template: Any) -> Any:
+    """Gives every process the state of process 0.
+
+    Args:
+      state: read on process 0 only.
+      template: the state's pytree, arrays or `jax.ShapeDtypeStruct`s.
+    """
+    if _alone():
+        return state
+    arrays = {
+        name: np.zeros(leaf.shape, jnp.dtype(leaf.dtype))
+        for name, leaf in describe(template).items()
+    }
+    if is_first():
+        saved = to_host(state)
+        arrays = {name: saved[name] for name in arrays}  # its order may be another
+    data = _from_first(_packed(arrays.values()))
+    values = _unpacked(data[None], arrays.values())
+    here = {name: x[0] for name, x in zip(arrays, values, strict=True)}
+    return from_host(here, template)
+
+
+def gather(tree: Any) -> Any:
+    """Returns the NumPy arrays of all processes, `[processes, ...]`, to all."""
+    leaves, structure = jax.tree.flatten(tree)
+    every = multihost_utils.process_allgather(_packed(leaves))
+    return structure.unflatten(_unpacked(every, leaves))
+
+
+def agree(number: int) -> int:
+    """Returns the largest number that any process has brought."""
+    if _alone():
+        return number
+    return int(multihost_utils.process_allgather(np.array(number, np.int32)).max())
+
+
+def _alone() -> bool:
+    """Asks in a way that starts no backend: usage errors come before that."""
+    return not jax.distributed.is_initialized()
+
+
+def _from_first(array: np.ndarray) -> np.ndarray:
+    return multihost_utils.broadcast_one_to_all(array)
+
+
+def _packed(arrays: Iterable[np.ndarray]) -> np.ndarray:
+    """Returns all bytes in one array: one message, and no arithmetic on numbers."""
+    return np.frombuffer(b"".join(np.asarray(x).tobytes() for x in arrays), np.uint8)
+
+
+def _unpacked(rows: np.ndarray, like: Iterable[np.ndarray]) -> list[np.ndarray]:
+    """Returns what was packed in every row of `[rows, bytes]`."""
+    done, found = 0, []
+    for x in like:
+        part = np.ascontiguousarray(rows[:, done : done + x.nbytes])
+        found.append(part.view(x.dtype).reshape(len(rows), *x.shape))
+        done += x.nbytes
+    return found

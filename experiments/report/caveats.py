@@ -1,0 +1,151 @@
+"""What a reader of the report must know: what is missing, unequal or not finite."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from experiments.report.logs import Row, Scores, number, read_json
+from experiments.report.tables import ARMS, TASKS, flat, in_order
+
+# Entries of a config that say what to run and where, not how.
+_NOT_SETTINGS = {
+    "phase", "arm", "preset", "seeds", "task", "out", "name", "source", "at_trial",
+    "tag", "video", "milestones", "allow_cpu", "debug", "chunk_length", "eval_trials",
+    "num_trials", "finetune_trials", "num_bits",
+}  # fmt: skip
+# What a phase keeps in its config for the phases after it.
+_FOR_LATER = {
+    "explore": {"task_length", "refit", "tuning", "task_planner", "pessimism"},
+    "zero-shot": {"tuning"},
+}
+
+
+def notes(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
+    """Returns sentences on the logs of one preset.
+
+    Args:
+      rows: of that preset.
+      found: the zero-shot scores of Table 1.
+      explored: the exploration trials that Table 1 is about.
+    """
+    return [
+        *_trials(rows),
+        *_missing(rows, found, explored),
+        *_not_finite(rows),
+        *_torn({row.run for row in rows}),
+        *_unequal({row.run: row.phase for row in rows}),
+    ]
+
+
+def _trials(rows: Sequence[Row]) -> Iterator[str]:
+    """Says how far each arm explored and how often it was evaluated."""
+    for arm in in_order({row.arm for row in rows}):
+        own = [row for row in rows if row.arm == arm]
+        done: dict[int, int] = {}
+        for row in own:
+            if row.phase == "explore":
+                done[row.seed] = max(done.get(row.seed, 0), row.trial)
+        groups = [
+            f"{trials} trials (seeds {_list(seed for seed, _ in items)})"
+            for trials, items in _grouped(done)
+        ]
+        explored = (
+            "explored " + " and ".join(groups) if groups else "no log of exploring"
+        )
+        evaluations = Counter(
+            (row.explored, row.seed, row.task)
+            for row in own
+            if row.phase == "zero-shot"
+        )
+        counts = sorted(set(evaluations.values()))
+        evaluated = f"; {_list(counts)} zero-shot trials per seed and task" * bool(
+            counts
+        )
+        yield f"`{arm}`: {explored}{evaluated}."
+
+
+def _grouped(done: dict[int, int]) -> Iterator[tuple[int, list[tuple[int, int]]]]:
+    pairs = sorted(done.items(), key=lambda pair: (-pair[1], pair[0]))
+    for trials, items in groupby(pairs, key=lambda pair: pair[1]):
+        yield trials, list(items)
+
+
+def _list(items: Iterable[object]) -> str:
+    return ", ".join(map(str, items))
+
+
+def _missing(rows: Sequence[Row], found: Scores, explored: int) -> Iterator[str]:
+    """Says which arms, tasks and seeds Table 1 and Figure 4 lack."""
+    arms = {row.arm for row in rows}
+    absent = [
+        arm
+        for arm in ARMS[:4]  # those of the paper
+        if arm not in arms and not any(a.startswith(f"{arm}-") for a in arms)
+    ]
+    if absent:
+        yield f"Missing: no log of {_list(absent)}."
+    none = f"no zero-shot after {explored} trials"
+    for arm in in_order(arms):
+        seeds = {row.seed for row in rows if row.arm == arm}
+        lacks = [task for task in TASKS if not found.get(arm, {}).get(task)]
+        if lacks:
+            yield f"Missing: `{arm}` has {none} on {_list(lacks)}."
+        for task in (task for task in TASKS if task not in lacks):
+            left = sorted(seeds - set(found[arm][task]))
+            if left:
+                yield f"Missing: `{arm}` has {none} on {task} of seeds {_list(left)}."
+    tuned = {
+        row.arm for row in rows if row.phase == "finetune" and row.explored == explored
+    }
+    untuned = in_order(arms - tuned)
+    if untuned:
+        yield f"Missing: no fine-tuning after {explored} trials of {_list(untuned)}."
+
+
+def _not_finite(rows: Sequence[Row]) -> Iterator[str]:
+    """Counts the returns that the tables leave out."""
+    for arm in in_order({row.arm for row in rows}):
+        for phase in ("explore", "zero-shot", "finetune"):
+            own = [r.data for r in rows if (r.arm, r.phase) == (arm, phase)]
+            if phase == "explore":
+                values = [
+                    x for data in own for x in (data.get("returns") or {}).values()
+                ]
+            else:
+                values = [data["return"] for data in own]
+            bad = sum(not np.isfinite(number(value)) for value in values)
+            if bad:
+                share = f"{bad} of {len(values)} returns"
+                yield f"`{arm}`: {share} of {phase} are not finite; left out."
+
+
+def _torn(runs: Iterable[Path]) -> Iterator[str]:
+    for run in sorted(runs):
+        if not (run / "metrics.jsonl").read_bytes().endswith(b"\n"):
+            yield f"The last line of {run.name}/metrics.jsonl is cut off; left out."
+
+
+def _unequal(runs: dict[Path, str]) -> Iterator[str]:
+    """Says which settings differ between runs of a phase that share a table."""
+    for phase in sorted(set(runs.values())):
+        skipped = _NOT_SETTINGS | _FOR_LATER.get(phase, set())
+        values: dict[str, dict[str, set[str]]] = {}
+        labels = set()
+        for run in sorted(run for run in runs if runs[run] == phase):
+            label = run.parent.name if phase != "explore" else run.name
+            labels.add(label)
+            for name, value in flat(read_json(run / "config.json")).items():
+                if name.split(".")[0] not in skipped:
+                    by_value = values.setdefault(name, {})
+                    by_value.setdefault(str(value), set()).add(label)
+        for name, by_value in values.items():
+            if len(by_value) > 1:
+                if silent := labels.difference(*by_value.values()):
+                    by_value["not recorded"] = silent
+                each = "; ".join(
+                    f"{v} ({_list(sorted(r))})" for v, r in by_value.items()
+                )
+                yield f"Unequal settings in {phase}: {name} is {each}."

@@ -1,0 +1,82 @@
+"""Sections of the report on the data of the arms: what it covers, who predicts it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from experiments.errors import UsageError
+from experiments.report import coverage, figures, logs, tables
+from experiments.report.coverage import Counts
+
+_COVERAGE = (
+    "Where the transitions of exploration ended: bins of 0.5 m/s by 1 rad/s, the "
+    "outermost ones open; white is a cell that no seed saw. Cells of the table: mean ± "
+    "standard deviation over seeds; % is of a seed's transitions. Arms with other "
+    "numbers of transitions cannot be compared by cells."
+)
+_MODEL_ERROR = (
+    "One step, on {rows} transitions of every seed, drawn once; without the random "
+    "trials at the start, which seeds of all arms share. No model is asked about the "
+    "data of its own run and seed. Cells: mean ± standard deviation over pairs of a "
+    "model and a data set, which are not independent. Models are of trial {trials}."
+)
+_ERROR = (
+    "Error of the members' mean prediction: root mean square over dimensions, each by "
+    "the standard deviation of its target in all that was drawn."
+)
+_NLL = (
+    "Negative log-likelihood in nats per dimension of the equal mixture of the members."
+)
+
+
+def covered(by_arm: Mapping[str, Counts], picture: Path) -> list[str]:
+    """Draws what each arm saw, and returns the section on it.
+
+    Args:
+      by_arm: counts `[V, W]` by arm and seed; none gives no section and no picture.
+      picture: file to write.
+    """
+    if not by_arm:
+        return []
+    by_arm = {arm: by_arm[arm] for arm in tables.in_order(by_arm)}
+    means = {arm: np.mean([*seeds.values()], axis=0) for arm, seeds in by_arm.items()}
+    edges = coverage.VELOCITY_EDGES, coverage.PITCH_RATE_EDGES
+    figures.coverage(picture, means, *edges)
+    measured = {
+        arm: {seed: coverage.measures(counts) for seed, counts in seeds.items()}
+        for arm, seeds in by_arm.items()
+    }
+    lines = ["## State coverage", "", f"![what each arm saw]({picture.name})", ""]
+    return [*lines, _COVERAGE, "", *tables.measures(measured)]
+
+
+def model_error(path: Path, preset: str) -> list[str]:
+    """Returns the section on a file that `experiments.tools.model_error` wrote.
+
+    Args:
+      path: without a file there is no section.
+      preset: of this report; the file may be of another one, and then there is none.
+
+    Raises:
+      UsageError: if it is another file.
+    """
+    if not path.exists():
+        return []
+    found = logs.read_json(path)
+    try:
+        if found["preset"] != preset:
+            return []
+        trials = sorted(
+            {t for seeds in found["trials"].values() for t in seeds.values()}
+        )
+        after = ", ".join(map(str, trials))
+        error, nll = tables.pairs(found["error"]), tables.pairs(found["nll"])
+        about = _MODEL_ERROR.format(rows=found["rows"], trials=after)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise UsageError(
+            f"{path} is not of experiments.tools.model_error ({error!r}); move it "
+            "elsewhere."
+        ) from error
+    lines = ["## Model error: whose model knows whose data", "", about, ""]
+    return [*lines, _ERROR, "", *error, _NLL, "", *nll]

@@ -1,0 +1,238 @@
+"""The folder of a run: its lock, its JSON files and its metrics log.
+
+A log is JSON Lines. A checkpoint remembers the size of the log when it was written; a
+resumed run cuts the log back to there, so that each trial is in it once.
+"""
+
+import contextlib
+import datetime
+import fcntl
+import json
+import math
+import os
+import re
+import socket
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.errors import CheckpointError, StorageError, UsageError
+from experiments.storage.disk import free_bytes, megabytes, storage_errors, sync
+from experiments.storage.environment import compare_environment, environment
+
+__all__ = [
+    "append_rows",
+    "check_name",
+    "compare_environment",
+    "cut_log",
+    "environment",
+    "lock",
+    "log_size",
+    "now",
+    "probe",
+    "read_json",
+    "write_json",
+]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_MAX_JSON_BYTES = 1_000_000
+
+
+def now() -> str:
+    """Returns the time in UTC, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def check_name(name: str) -> None:
+    """Raises UsageError unless `name` can only be one folder below the output."""
+    if not _NAME.fullmatch(name):
+        shown = name if len(name) <= 64 else name[:61] + "..."
+        raise UsageError(
+            f"run {shown!r} is not a valid name (use letters, digits, '.', '_', '-', "
+            "at most 64, starting with a letter or digit)."
+        )
+
+
+@contextlib.contextmanager
+def lock(run_dir: Path) -> Iterator[None]:
+    """Holds a run directory for this process; the kernel frees it if we are killed.
+
+    Raises:
+      CheckpointError: Another process holds it; the message says which.
+      StorageError: The directory cannot be made or locked.
+    """
+    path = run_dir / ".lock"
+    with storage_errors(f"lock {run_dir}"):
+        run_dir.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    try:
+        with storage_errors(f"lock {run_dir}"):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise CheckpointError(
+                    f"{run_dir} is in use by {_holder(file)}. Stop it or choose "
+                    "another run directory."
+                ) from None
+            owner = {
+                "pid": os.getpid(),
+                "host": socket.gethostname(),
+                "start": time.strftime("%Y-%m-%d %H:%M:%S"),
+            }
+            os.ftruncate(file, 0)
+            os.pwrite(file, json.dumps(owner).encode(), 0)
+        yield
+    finally:
+        os.close(file)  # Never unlinked: a waiting process may have it open already.
+
+
+def _holder(file: int) -> str:
+    """Describes who wrote a lock file, as far as it can be read."""
+    try:
+        owner = json.loads(os.pread(file, 4096, 0))
+        return f"pid {owner['pid']} on host {owner['host']} since {owner['start']}"
+    except (ValueError, KeyError, TypeError):
+        return "another process"
+
+
+def probe(run_dir: Path, needed_bytes: int) -> None:
+    """Makes a run directory, and writes and reads there before anything is compiled.
+
+    Raises:
+      StorageError: It cannot be written, or has less than `needed_bytes` free.
+    """
+    path = run_dir / f".probe-{os.getpid()}"
+    data = os.urandom(4096)
+    with storage_errors(f"write in {run_dir}"):
+        run_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            path.write_bytes(data)
+            sync(path)
+            same = path.read_bytes() == data
+        finally:
+            path.unlink(missing_ok=True)
+    if not same:
+        raise StorageError(f"{run_dir} does not read back what is written. Check it.")
+    if (free := free_bytes(run_dir)) < needed_bytes:
+        raise StorageError(
+            f"no space in {run_dir} (a run needs {megabytes(needed_bytes)}, "
+            f"{megabytes(free)} free). Free space or choose another run directory."
+        )
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Replaces a JSON file at once; a reader sees the old file or the new one."""
+    text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
+    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with storage_errors(f"write {path}"):
+        try:
+            draft.write_text(text, encoding="utf-8")
+            sync(draft)
+            draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
+        sync(path.parent)
+
+
+def read_json(path: Path) -> Any:
+    """Reads a JSON file of a run.
+
+    Raises:
+      CheckpointError: It is missing, too large or not JSON; the message says where.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path} does not exist or is not a file.")
+    try:
+        with path.open("rb") as file:
+            data = file.read(_MAX_JSON_BYTES + 1)
+        if len(data) > _MAX_JSON_BYTES:
+            raise CheckpointError(
+                f"{path} is larger than {megabytes(_MAX_JSON_BYTES)}. It is not a file "
+                "of a run."
+            )
+        return json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+    except json.JSONDecodeError as error:
+        why = f"{error.msg}, line {error.lineno}, column {error.colno}"
+    except (UnicodeDecodeError, ValueError, RecursionError, OSError) as error:
+        why = str(error)
+    raise CheckpointError(f"{path} cannot be read ({why}). Restore or remove it.")
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def append_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Appends rows to a log in one write; they are on the disk on return.
+
+    Args:
+      path: The log.
+      rows: Numbers may be Python's, NumPy's or jax's; NaN and infinity become null.
+    """
+    lines = [json.dumps(_plain(row), allow_nan=False) + "\n" for row in rows]
+    with storage_errors(f"write {path}"), path.open("ab", buffering=0) as file:
+        start = file.seek(0, os.SEEK_END)
+        try:
+            _write_all(file.fileno(), "".join(lines).encode())
+            os.fsync(file.fileno())
+        except OSError:
+            file.truncate(start)  # Half a row would spoil the next one.
+            raise
+
+
+def _write_all(file: int, data: bytes) -> None:
+    while data:
+        data = data[os.write(file, data) :]
+
+
+def log_size(path: Path) -> int:
+    """Returns the bytes in a log, for the meta of a checkpoint; 0 if there is none."""
+    return path.stat().st_size if path.exists() else 0
+
+
+def cut_log(path: Path, offset: int) -> None:
+    """Cuts a log back to what a checkpoint knows of.
+
+    The rest goes to `<path>.orphan`, after what is there.
+
+    Args:
+      path: The log; need not exist if `offset` is 0.
+      offset: `log_size` when the checkpoint was written.
+
+    Raises:
+      CheckpointError: The log is shorter than that.
+    """
+    size = log_size(path)
+    if size < offset:
+        raise CheckpointError(
+            f"{path} has {size} bytes, but its checkpoint knows of {offset}. Restore "
+            "the file or start over in another run directory."
+        )
+    if size == offset:
+        return
+    with storage_errors(f"cut {path}"), path.open("rb+") as file:
+        file.seek(offset)
+        rest = file.read()
+        with path.with_name(path.name + ".orphan").open("ab") as orphans:
+            orphans.write(rest if rest.endswith(b"\n") else rest + b"\n")
+            orphans.flush()
+            os.fsync(orphans.fileno())
+        file.truncate(offset)
+        os.fsync(file.fileno())
+
+
+def _plain(value: Any) -> Any:
+    """Returns JSON values: arrays as lists, NaN and infinity as None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return _plain(np.asarray(value).tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -1,0 +1,299 @@
+"""Renders a recorded trial of HalfCheetah, in a process of its own.
+
+`python -m experiments.tools.video TRAJECTORIES.npz OUT.mp4 --task forward --seed 0
+--trial 1`
+
+OpenGL can crash, and its backend is chosen once per process; an experiment of hours
+must depend on neither. So `render` starts this module as a child.
+"""
+
+import argparse
+import math
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.errors import RunError, UsageError
+
+_NO_GL = 69  # exit code of the child where OpenGL does not work; EX_UNAVAILABLE
+_BACKENDS = ("egl", "osmesa")
+_GL_HINT = (
+    "on Debian or Ubuntu install libegl1 libopengl0 libgl1-mesa-dri"
+    " (or libosmesa6, with MUJOCO_GL=osmesa)"
+)
+_SIZE_RANGE = range(64, 4097)
+_FPS_RANGE = range(1, 121)
+
+# A GIF is for a page: a small cut with few colours.
+_GIF_WIDTH = 280
+_GIF_COLORS = 48
+_GIF_SKIP = 2  # every second frame
+
+
+class Look(NamedTuple):
+    """Size in pixels and frames per second."""
+
+    width: int = 640
+    height: int = 360
+    fps: int = 20  # the environment's steps a second: real time
+
+
+def render(
+    npz: Path, target: Path, *, task: str, seed: int, trial: int, gif: bool = False
+) -> None:
+    """Renders a trial (see `load_trial`) to mp4, and GIF, in a child process.
+
+    MUJOCO_GL of the user is obeyed; otherwise EGL is tried, then OSMesa.
+
+    Raises:
+      RunError: if no OpenGL works here, or the child fails; one line says why.
+    """
+    command = [sys.executable, "-m", "experiments.tools.video", str(npz), str(target)]
+    command += [f"--task={task}", f"--seed={seed}", f"--trial={trial}"]
+    command += ["--gif"] * gif
+    chosen = os.environ.get("MUJOCO_GL")
+    failures = []
+    for backend in (chosen,) if chosen else _BACKENDS:
+        env = _child_env(backend)
+        child = subprocess.run(command, check=False, env=env, capture_output=True)
+        if child.returncode == 0:
+            return
+        said = child.stderr.decode(errors="replace").strip().splitlines()
+        # Destructors may have a word after the error.
+        errors = [line for line in said if line.startswith("error: ")] or said
+        reason = errors[-1].removeprefix("error: ") if errors else "it said nothing"
+        if child.returncode < 0:  # a GL driver that crashes is as good as none
+            reason = f"ended by signal {-child.returncode}"
+        elif child.returncode != _NO_GL:
+            raise RunError(reason)
+        failures.append(f"{backend}: {reason}")
+    raise RunError(f"cannot render a video, {'; '.join(failures)}. {_GL_HINT}")
+
+
+def _child_env(backend: str) -> dict[str, str]:
+    """Returns the environment in which a child renders and leaves the GPU to JAX."""
+    here = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+    own = {"MUJOCO_GL": backend, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
+    return os.environ | own
+
+
+def load_trial(npz: Path, *, task: str, seed: int, trial: int) -> np.ndarray:
+    """Reads one trial from recorded trajectories.
+
+    Args:
+      npz: holds obs `[S, K, R, T, 18]` float32, each after its step, seeds `[S]`,
+        tasks `[K]` and returns `[S, K, R]`.
+      task: an entry of tasks.
+      seed: an entry of seeds.
+      trial: from 1 to R.
+
+    Returns:
+      obs `[T, 18]`.
+
+    Raises:
+      UsageError: if the file is not such a file or does not hold the trial.
+      RunError: if the trial is not finite.
+    """
+    try:
+        with np.load(npz, allow_pickle=False) as file:
+            obs, seeds, tasks = file["obs"], file["seeds"], file["tasks"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{npz} holds no trajectories ({error})") from error
+    if obs.ndim != 5 or obs.shape[:2] != (len(seeds), len(tasks)):
+        raise UsageError(
+            f"{npz}: obs must be [seeds, tasks, trials, steps, 18], got {obs.shape}"
+        )
+    seed_names, task_names = seeds.tolist(), tasks.tolist()
+    if task not in task_names:
+        raise UsageError(f"--task {task}: {npz} holds {', '.join(task_names)}")
+    if seed not in seed_names:
+        raise UsageError(f"--seed {seed}: {npz} holds {seed_names}")
+    if not 1 <= trial <= obs.shape[2]:
+        raise UsageError(f"--trial {trial}: {npz} holds 1 to {obs.shape[2]}")
+    chosen = obs[seed_names.index(seed), task_names.index(task), trial - 1]
+    finite = np.isfinite(chosen).all(axis=-1)
+    if not finite.all():
+        raise RunError(f"{npz}: the trial is not finite from step {finite.argmin()} on")
+    return chosen
+
+
+Draw = Callable[[np.ndarray], np.ndarray]  # qpos [9] -> picture [height, width, 3]
+
+
+def open_renderer(look: Look) -> Draw:
+    """Returns what draws the robot; fails, in many ways, where OpenGL does not work."""
+    import mujoco
+
+    from jaxpets.envs import half_cheetah
+
+    gl: Any = mujoco  # its stubs lack half of it
+    model: Any = half_cheetah.load_model()
+    model.vis.global_.offwidth, model.vis.global_.offheight = look.width, look.height
+    renderer, data = gl.Renderer(model, look.height, look.width), gl.MjData(model)
+    floor = model.geom("floor")
+    # A good runner leaves the 80 m of floor and the light. The floor's pattern repeats,
+    # so a robot put back by whole periods looks the same and stays in the middle.
+    period = 2.0 * floor.size[0] / model.mat(floor.matid[0]).texrepeat[0]
+
+    def draw(qpos: np.ndarray) -> np.ndarray:
+        data.qpos[:] = qpos
+        data.qpos[0] %= period
+        gl.mj_forward(model, data)
+        renderer.update_scene(data, camera="track")
+        return renderer.render()
+
+    return draw
+
+
+def write_mp4(target: Path, pictures: Iterator[np.ndarray], look: Look) -> None:
+    """Writes pictures as H.264; target appears only when it is complete."""
+    import imageio_ffmpeg
+
+    partial = target.with_name(f".{target.stem}.partial.mp4")
+    size = (look.width, look.height)
+    # yuv420p wants even sizes, no more.
+    writer = imageio_ffmpeg.write_frames(
+        str(partial), size, fps=look.fps, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    writer.send(None)
+    try:
+        for picture in pictures:
+            writer.send(np.ascontiguousarray(picture))
+        writer.close()
+        os.replace(partial, target)
+    finally:
+        writer.close()
+        partial.unlink(missing_ok=True)
+
+
+def write_gif(target: Path, cut: list[np.ndarray], *, fps: float) -> None:
+    """Writes pictures as a small GIF, with one palette for all its frames."""
+    from PIL import Image
+
+    height = round(_GIF_WIDTH * cut[0].shape[0] / cut[0].shape[1])
+    small = [Image.fromarray(p).resize((_GIF_WIDTH, height)) for p in cut]
+    # Half of the colours by frequency, for the sky; half by coverage, for the robot.
+    every = Image.fromarray(np.concatenate([np.asarray(p) for p in small[::5]]))
+    colors: list[int] = []
+    for method in (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE):
+        half = every.quantize(_GIF_COLORS // 2, method)
+        colors += (half.getpalette() or [])[: 3 * _GIF_COLORS // 2]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colors)
+    # No dither: its noise changes every frame, which is what costs bytes.
+    indexed = [s.quantize(palette=palette, dither=Image.Dither.NONE) for s in small]
+    indexed[0].save(
+        target,
+        save_all=True,
+        append_images=indexed[1:],
+        duration=round(1000 / fps),
+        loop=0,
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.tools.video",
+        description="Renders a recorded trial of HalfCheetah to mp4.",
+    )
+    parser.add_argument("npz", type=Path, help="trajectories.npz of a run")
+    parser.add_argument("target", type=Path, help="the .mp4 to write")
+    parser.add_argument("--task", required=True, help="for example forward")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--trial", type=int, default=1, help="counted from 1")
+    parser.add_argument("--fps", type=int, default=Look().fps, help="20 is real time")
+    parser.add_argument("--width", type=int, default=Look().width)
+    parser.add_argument("--height", type=int, default=Look().height)
+    parser.add_argument("--gif", action="store_true", help="also write a short .gif")
+    parser.add_argument("--gif-start", type=float, default=10.0, help="in s")
+    parser.add_argument("--gif-seconds", type=float, default=4.0)
+    return parser
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.target.suffix != ".mp4":
+        raise UsageError(f"the target must end in .mp4, got {args.target}")
+    ranges = {"width": _SIZE_RANGE, "height": _SIZE_RANGE, "fps": _FPS_RANGE}
+    for name, valid in ranges.items():
+        value = getattr(args, name)
+        if value not in valid:
+            raise UsageError(
+                f"--{name} {value}: from {valid.start} to {valid.stop - 1}"
+            )
+    if args.width % 2 or args.height % 2:
+        raise UsageError(f"--width {args.width} --height {args.height}: must be even")
+    for name, low in [("gif_start", 0.0), ("gif_seconds", 0.1)]:
+        if not low <= getattr(args, name) < math.inf:
+            flag = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{flag} {getattr(args, name)}: at least {low}")
+
+
+def _render_here(args: argparse.Namespace) -> None:
+    _check(args)
+    obs = load_trial(args.npz, task=args.task, seed=args.seed, trial=args.trial)
+    look = Look(args.width, args.height, args.fps)
+    try:
+        draw = open_renderer(look)
+    except Exception as error:  # ImportError, RuntimeError, AttributeError, ...
+        reason = str(error).splitlines() or [type(error).__name__]
+        print(f"error: {reason[0]}", file=sys.stderr)
+        raise SystemExit(_NO_GL) from error
+    wanted = _gif_steps(args, len(obs))
+    cut: list[np.ndarray] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        for step, qpos in enumerate(_positions(obs)):
+            picture = draw(qpos)
+            if step in wanted:
+                cut.append(picture)
+            yield picture
+
+    args.target.parent.mkdir(parents=True, exist_ok=True)
+    write_mp4(args.target, pictures(), look)
+    if cut:
+        write_gif(args.target.with_suffix(".gif"), cut, fps=args.fps / _GIF_SKIP)
+
+
+def _positions(obs: np.ndarray) -> np.ndarray:
+    """Returns qpos `[T, 9]`; called once ffmpeg runs, as JAX dislikes later forks."""
+    import jax.numpy as jnp
+
+    from jaxpets.envs import half_cheetah
+
+    return np.asarray(half_cheetah.qpos_from_obs(jnp.asarray(obs)))
+
+
+def _gif_steps(args: argparse.Namespace, num_steps: int) -> range:
+    """Returns the steps that the GIF shows; a start too late is moved forward."""
+    if not args.gif:
+        return range(0)
+    length = min(max(round(args.gif_seconds * args.fps), 1), num_steps)
+    first = min(round(args.gif_start * args.fps), num_steps - length)
+    return range(first, first + length, _GIF_SKIP)
+
+
+def main() -> None:
+    """Runs the command line; errors are one line and an exit code."""
+    args = _parser().parse_args()
+    # Read once, when JAX and MuJoCo are imported. Rendering needs no GPU of JAX's.
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ.setdefault("MUJOCO_GL", _BACKENDS[0])
+    try:
+        _render_here(args)
+    except RunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error
+    except OSError as error:
+        print(f"error: cannot write {args.target} ({error})", file=sys.stderr)
+        raise SystemExit(5) from error
+
+
+if __name__ == "__main__":
+    main()

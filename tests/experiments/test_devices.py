@@ -1,0 +1,210 @@
+"""Seeds, tasks and trials over several devices: the same run, and nothing to say."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import runs
+
+from experiments.parallel import devices
+from experiments.run import main
+from experiments.storage import checkpoint
+
+SCRIPT = Path(__file__).with_name("on_four_devices.py")
+TASKS = "zero-shot-003"
+
+
+@pytest.mark.parametrize(
+    ("counts", "limit", "wanted"),
+    [
+        ((4, 1, 1), 4, (4, 1, 1)),
+        ((1, 4, 5), 4, (1, 4, 1)),
+        ((1, 1, 5), 4, (1, 1, 1)),
+        ((1, 1, 6), 4, (1, 1, 3)),
+        ((2, 4, 1), 4, (2, 2, 1)),
+        ((3, 4, 5), 8, (3, 2, 1)),
+        ((3, 1, 1), 2, (1, 1, 1)),
+        ((16, 4, 5), 8, (8, 1, 1)),
+        ((1, 1, 1), 8, (1, 1, 1)),
+    ],
+)
+def test_the_most_equal_parts_seeds_first(counts, limit, wanted):
+    found = devices.grid(counts, limit)
+    assert found == wanted
+    whole = math.prod(counts)
+    best = max(d for d in range(1, limit + 1) if whole % d == 0)
+    assert math.prod(found) == best
+    assert all(c % part == 0 for c, part in zip(counts, found, strict=True))
+
+
+@pytest.mark.parametrize("axes", [devices.AXES[:1], devices.AXES[:2], devices.AXES])
+def test_blocks_of_hosts_make_the_whole_again(axes):
+    counts, parts = (4, 6, 5), {"seed": 2, "task": 3, "trial": 1}
+    hosts = tuple(parts[axis] if axis in axes else 1 for axis in devices.AXES)
+    shape = counts[: len(axes)]
+    whole = {
+        "rows": np.arange(math.prod(shape) * 2).reshape(*shape, 2),
+        "flag": np.arange(math.prod(shape)).reshape(shape) % 3 == 0,
+        "size": np.array(7, np.int32),
+    }
+    spread = devices.spread(*counts)
+    blocks = []
+    for host in np.ndindex(hosts):
+        own = spread._replace(hosts=hosts, host=host)
+        blocks.append(devices.block(own, whole, *axes))
+    for i, axis in enumerate(axes):
+        assert blocks[0]["rows"].shape[i] == counts[i] // parts[axis]
+    blocks.append(blocks[0])  # a host too many repeats another's
+    every = jax.tree.map(lambda *x: np.stack(x), *blocks)
+    found = devices.join(spread._replace(hosts=hosts), every, *axes)
+    for name, array in whole.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+def test_one_device_is_left_as_it_is():
+    spread = devices.spread(3, 4)
+    tree = {"x": jnp.ones((3, 4, 2)), "size": jnp.int32(1)}
+    assert spread.mesh.size == 1 and devices.idle(spread) is None
+    assert devices.split(spread, len, None, None) is len
+    assert devices.place(spread, tree, "seed", "task")["x"] is tree["x"]
+    assert devices.collect(spread, tree, "seed", "task")["x"] is tree["x"]
+    assert [devices.each(spread, axis) for axis in devices.AXES] == [3, 4, 1]
+
+
+# With devices that one CPU pretends to have.
+
+
+class Runs(NamedTuple):
+    """What was run, on how many devices; seeds 0 to 3 unless there is one."""
+
+    alone: Path  # seed 3, one device
+    one: Path  # one device
+    four: Path  # four devices
+    one_then_four: Path  # the last trial on four devices
+    four_then_one: Path
+    said: str  # by the process with four devices
+    seen: dict  # see on_four_devices.py
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    out = tmp_path_factory.mktemp("devices")
+    alone = runs.explore(out / "alone", 3)
+    one = runs.explore(out / "one", 0, 1, 2, 3)
+    one_then_four = runs.unfinished(one, out / "one-four")
+    four = out / "four" / runs.NAME
+    process = runs.start(SCRIPT, out, alone, one_then_four, devices=4)
+    said, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    seen = json.loads(said.splitlines()[-1])
+    assert seen["codes"] == [0, 0, 0], errors
+    assert seen["devices"] == 4
+    four_then_one = runs.unfinished(four, out / "four-one")
+    assert runs.explore(four_then_one.parent, 0, 1, 2, 3) == four_then_one
+    return Runs(alone, one, four, one_then_four, four_then_one, errors, seen)
+
+
+def close(one, other, **tolerance):
+    assert runs.numbers(one) == pytest.approx(runs.numbers(other), **tolerance)
+
+
+@pytest.mark.slow
+def test_a_seed_on_its_device_is_the_seed_alone(found):
+    """In every trial; a CPU in four parts sums a little otherwise than a whole one."""
+    many = [row for row in runs.rows(found.four) if row["seed"] == 3]
+    assert len(many) == runs.LAST
+    for row, alone in zip(many, runs.rows(found.alone), strict=True):
+        close(row, alone, rel=1e-3, abs=1e-3)
+    actions = [
+        np.asarray(runs.learner(folder).dataset.data.action)[-1]
+        for folder in (found.four, found.alone)
+    ]
+    np.testing.assert_array_equal(*actions)
+
+
+@pytest.mark.slow
+def test_four_devices_log_what_one_does(found):
+    """The random trial up to rounding, which physics amplifies; all labels."""
+    labels = ("seed", "trial", "steps", "phase", "arm", "planner")
+    many, one = runs.rows(found.four), runs.rows(found.one)
+    assert len(many) == 4 * runs.LAST
+    for row, other in zip(many, one, strict=True):
+        assert [row[name] for name in labels] == [other[name] for name in labels]
+        if row["trial"] == 1:
+            close(row, other, rel=1e-2, abs=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["one_then_four", "four_then_one"])
+def test_a_run_goes_on_with_another_number_of_devices(found, name):
+    """From the very state that was saved: the older data are there bit for bit."""
+    begun = {"one_then_four": found.one, "four_then_one": found.four}[name]
+    resumed = getattr(found, name)
+    old = [row for row in runs.rows(begun) if row["trial"] < runs.LAST]
+    assert runs.rows(resumed)[: len(old)] == old
+    new = runs.rows(resumed)[len(old) :]
+    assert [(row["seed"], row["trial"]) for row in new] == [(s, 3) for s in range(4)]
+    assert checkpoint.steps(resumed / "checkpoints")[-1] == runs.LAST
+    before, after = runs.learner(begun, runs.LAST - 1), runs.learner(resumed)
+    known = runs.STEPS * (runs.LAST - 1)
+    assert int(before.dataset.size) == known
+    assert int(after.dataset.size) == known + runs.STEPS
+    for a, b in zip(before.dataset.data, after.dataset.data, strict=True):
+        np.testing.assert_array_equal(a[:, :known], b[:, :known])
+    if name == "one_then_four":
+        assert "device_count was 1 and is now 4" in found.said
+
+
+@pytest.mark.slow
+def test_tasks_of_one_seed_are_spread(found, tmp_path):
+    """Restored from a run on one device and refit; the same returns as there."""
+    assert found.seen["tasks"] == [1, 4, 1]
+    spread = found.alone / TASKS
+    shutil.copytree(found.alone, tmp_path / runs.NAME)
+    here = tmp_path / runs.NAME / TASKS
+    shutil.rmtree(here)
+    assert main(["--phase", "zero-shot", "--from", str(here.parent), *runs.REFIT]) == 0
+    for row, other in zip(runs.rows(spread), runs.rows(here), strict=True):
+        assert row["task"] == other["task"]
+        close(row, other, rel=1e-2, abs=1e-2)
+    paths = [np.load(folder / "trajectories.npz") for folder in (spread, here)]
+    assert paths[0]["obs"].shape == paths[1]["obs"].shape == (1, 4, 1, runs.STEPS, 18)
+
+
+@pytest.mark.slow
+def test_devices_have_nothing_to_say_to_each_other(found):
+    assert found.seen["acting"] == {"devices": 4, "communication": []}
+
+
+@pytest.mark.slow
+def test_what_cannot_be_spread_evenly_is_said(found):
+    line = "using 3 of 4 devices; 3 seeds cannot be spread over more in equal parts."
+    assert found.seen["idle"] == line
+    assert "cannot be spread" not in found.said
+
+
+@pytest.mark.slow
+def test_one_plan_over_four_devices(found):
+    """One all-gather; all agree, and find what one device does with four parts."""
+    plan = found.seen["plan"]
+    assert plan["communication"] == ["all-gather"]
+    assert plan["shards"] == 4 and plan["spread"] == 0.0
+    assert plan["difference"] < 1e-4
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_scaling(found):
+    rows = found.seen["benchmark"]
+    names = [(row["benchmark"], row["sizes"]["devices"]) for row in rows]
+    assert names == [("scale-seeds", 2), ("scale-candidates", 2)]  # there are no 64
+    for row in rows:
+        assert row["difference"] < 1e-4
+        assert min(row[name] for name in ("one_ms", "all_ms", "efficiency")) > 0
+    assert rows[1]["sizes"]["num_samples"] == 16 * rows[0]["sizes"]["num_samples"]

@@ -1,0 +1,126 @@
+"""The fit between exploration and phase 2, in whole runs of the preset smoke."""
+
+import shutil
+
+import jax
+import numpy as np
+import optax
+import pytest
+import runs
+import toys
+
+import jaxpets
+from experiments import cli, phases
+from experiments.build import REFIT, build, trial_keys
+from experiments.run import main
+from experiments.storage import checkpoint
+from experiments.tools import pretrained
+from jaxpets.envs import half_cheetah
+
+FLAGS = (
+    "--task", "front-flip", "--eval-trials", "1",
+    "--refit.num-epochs", "3", "--refit.batch-size", "16", "--refit.final-rate", "0.1",
+)  # fmt: skip
+SAID = "refit: 3 epochs of 60 transitions"
+TASK = "zero-shot-003-front-flip"
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory):
+    return runs.explore(tmp_path_factory.mktemp("explored"), 0, 7)
+
+
+@pytest.fixture(scope="module")
+def performed(explored):
+    """The folder of a zero-shot with a refit."""
+    assert main(["--phase", "zero-shot", "--from", str(explored), *FLAGS]) == 0
+    return explored / TASK
+
+
+def model(folder, config):
+    template = phases.model_of(phases.explored_template(config, build(config)))
+    found = checkpoint.restore(folder / "checkpoints", template, warn=pytest.fail)
+    assert found is not None and found[0] == runs.LAST
+    return found[1].params
+
+
+@pytest.mark.slow
+def test_the_model_that_performs_is_refit_on_all_data(explored, performed):
+    config = cli.parse(["--phase", "zero-shot", "--from", str(explored), *FLAGS])
+    state = runs.learner(explored)
+    fitter = jaxpets.fit(
+        jaxpets.ensemble(
+            jaxpets.EnsembleConfig(
+                num_members=3,
+                hidden_sizes=(16, 16),
+                weight_decays=(2.5e-5, 5e-5, 1e-4),
+                state_margin=0.5,
+            ),
+            half_cheetah.model_space(),
+            obs_size=18,
+            action_size=6,
+        ),
+        optax.adam(1e-3),
+        jaxpets.FitConfig(3, 16, 0.1),
+    )
+    keys = trial_keys(config, REFIT, runs.LAST)
+    for i in range(2):
+        own = jax.tree.map(lambda x, i=i: x[i] if x.ndim else x, state)
+        want, _, metrics = jax.jit(fitter.step)(
+            own.params, keys[i], own.fit, own.dataset
+        )
+        assert metrics.num_updates == 3 * 4  # 60 rows in batches of 16
+        got = jax.tree.map(lambda x, i=i: x[i], model(performed, config))
+        toys.assert_trees_close(got, want, rtol=1e-3, atol=1e-5)
+        moved = jax.tree.leaves(got.network)[1] - jax.tree.leaves(own.params.network)[1]
+        assert np.abs(moved).max() > 1e-4
+
+
+@pytest.mark.slow
+def test_a_stopped_zero_shot_does_not_refit_again(
+    performed, explored, tmp_path, capsys
+):
+    again = tmp_path / runs.NAME
+    shutil.copytree(explored, again)
+    (again / TASK / "metrics.jsonl").unlink()
+    assert main(["--phase", "zero-shot", "--from", str(again), *FLAGS]) == 0
+    assert "refit" not in capsys.readouterr().err
+    want = [runs.numbers(row) for row in runs.rows(performed)]
+    assert [runs.numbers(row) for row in runs.rows(again / TASK)] == want
+
+
+@pytest.mark.slow
+def test_finetune_refits_once(explored, tmp_path, capsys):
+    again = tmp_path / runs.NAME
+    shutil.copytree(explored, again, ignore=shutil.ignore_patterns("zero-shot*"))
+    command = ["--phase", "finetune", "--from", str(again), *FLAGS]
+    assert main(command) == 0
+    assert capsys.readouterr().err.count(SAID) == 1
+    tuned = again / "finetune-003-front-flip"
+    want = [runs.numbers(row) for row in runs.rows(tuned)]
+    shutil.rmtree(tuned / "checkpoints" / "5")
+    assert main(command) == 0
+    assert "refit" not in capsys.readouterr().err
+    assert [runs.numbers(row) for row in runs.rows(tuned)] == want
+
+
+@pytest.mark.slow
+def test_one_seed_of_several_is_shipped(
+    explored, performed, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(cli, "PRETRAINED", tmp_path)
+    assert pretrained.main([str(explored), "mine", "--seed", "7"]) == 0
+    config = cli.parse(["--phase", "zero-shot", "--from", str(explored), *FLAGS])
+    flags = ["--from", "pretrained/mine", "--task-planner.num-particles", "3"]
+    shipped = cli.parse(["--phase", "zero-shot", *flags])
+    assert (shipped.seeds, shipped.refit.num_epochs) == ((7,), 0)
+    jax.tree.map(
+        lambda one, both: np.testing.assert_array_equal(one[0], both[1]),
+        model(tmp_path / "mine", shipped),
+        model(performed, config),
+    )
+    assert [row["seed"] for row in runs.rows(tmp_path / "mine")] == [7, 7, 7]
+    capsys.readouterr()
+    assert pretrained.main([str(explored), "other", "--seed", "3"]) == 2
+    line = "error: --seed 3 is not valid; it must be one of 0, 7.\n"
+    assert capsys.readouterr().err == line

@@ -1,0 +1,334 @@
+"""The report, from small logs whose every number is known."""
+
+import json
+
+import numpy as np
+import pytest
+from small_logs import EXPLORED, explore_rows, write_run
+
+from experiments.errors import UsageError
+from experiments.report.report import load, write_report
+from jaxpets.envs.half_cheetah import TASK_NAMES
+
+# Zero-shot scores by seed; a task adds 10 times its place.
+SCORES = {"epistemic": [400.0, 500.0, 900.0], "count": [100.0, 200.0, 150.0]}
+
+
+def zero_shot_rows(arm, scores, explored=EXPLORED):
+    """Two trials a seed, 7 above and below the score."""
+    return [
+        {
+            "phase": "zero-shot",
+            "arm": arm,
+            "seed": seed,
+            "task": task,
+            "trial": trial,
+            "explored_trials": explored,
+            "return": score + 10.0 * i + (7.0 if trial == 1 else -7.0),
+        }
+        for seed, score in enumerate(scores)
+        for i, task in enumerate(TASK_NAMES)
+        for trial in (1, 2)
+    ]
+
+
+def finetune_rows(arm, seeds):
+    return [
+        {
+            "phase": "finetune",
+            "arm": arm,
+            "seed": seed,
+            "task": task,
+            "trial": EXPLORED + k,
+            "explored_trials": EXPLORED,
+            "return": 1000.0 * k + seed,
+        }
+        for seed in seeds
+        for task in TASK_NAMES
+        for k in (1, 2)
+    ]
+
+
+def write_arm(out, arm, scores, **config):
+    run = out / f"{config.get('preset', 'laptop')}-{arm}"
+    common = {"arm": arm, "num_trials": EXPLORED, **config}
+    seeds = range(len(scores))
+    write_run(run, explore_rows(arm, seeds), phase="explore", **common)
+    zero_shot = run / f"zero-shot-{EXPLORED:03d}"
+    write_run(zero_shot, zero_shot_rows(arm, scores), phase="zero-shot", **common)
+    return run
+
+
+@pytest.fixture
+def out(tmp_path):
+    for arm, scores in SCORES.items():
+        run = write_arm(tmp_path / "runs", arm, scores)
+    write_run(
+        run / f"finetune-{EXPLORED:03d}",
+        finetune_rows("count", range(2)),
+        phase="finetune",
+        arm="count",
+    )
+    return tmp_path / "runs"
+
+
+def report_of(out):
+    write_report(out, out / "report")
+    table = json.loads((out / "report" / "table1.json").read_text())
+    return (out / "report" / "report.md").read_text(), table
+
+
+def edit_rows(log, change):
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    rows = [change(row) or row for row in rows]
+    log.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def test_table_1_json_holds_the_scores_of_every_seed(out):
+    _, table = report_of(out)
+    assert list(table) == ["epistemic", "count-16"]
+    for arm, scores in SCORES.items():
+        by_task = table["count-16" if arm == "count" else arm]
+        assert tuple(by_task) == TASK_NAMES
+        for i, task in enumerate(TASK_NAMES):
+            entry = by_task[task]
+            assert set(entry) == {"seeds", "mean", "iqm", "ci95"}
+            np.testing.assert_allclose(entry["seeds"], np.array(scores) + 10.0 * i)
+            assert entry["mean"] == pytest.approx(np.mean(scores) + 10.0 * i)
+            assert entry["iqm"] == pytest.approx(entry["mean"])  # fewer than 4 seeds
+            low, high = entry["ci95"]
+            assert min(entry["seeds"]) <= low < entry["mean"] < high
+            assert high <= max(entry["seeds"])
+
+
+def test_report_shows_means_spread_and_every_seed(out):
+    text, _ = report_of(out)
+    # 400, 500, 900: mean 600, standard deviation sqrt(70000).
+    assert "| forward | 600 ± 265<br>[" in text
+    assert "| count-16 | 2 | 150 | 160 | 170 | 180 |" in text
+    assert "| P(epistemic > ...) | count-16 |" in text
+    assert "| forward | 1.00 |" in text
+    assert "paper: SU-PETS" not in text
+    # Trials 4 and 5 of two seeds.
+    assert "| 4 | 1000 ± 0.7 (2 seeds) |" in text
+    assert "| 5 | 2000 ± 0.7 (2 seeds) |" in text
+    assert "| laptop-epistemic | 3 | 3 | 4.00 | 1.00 | 5.00 |" in text
+    assert "jax 9.9, device_kind abacus" in text
+    # Trial 1 of 3 seeds, the same in both arms: -(1 + seed).
+    assert "mean of 3 trials: forward -2.0" in text
+
+
+def test_all_trials_of_the_random_arm_are_random(tmp_path):
+    write_arm(tmp_path / "runs", "random", [1.0])
+    text, _ = report_of(tmp_path / "runs")
+    assert "mean of 3 trials: forward -2.0" in text  # -(trial + seed)
+
+
+def test_another_attempt_is_a_row_of_its_own(out):
+    scores = {"epistemic": [40.0, 50.0, 90.0]}
+    rows = zero_shot_rows("epistemic", scores["epistemic"])
+    before, table = report_of(out)
+    folder = out / "laptop-epistemic" / "zero-shot-003-short"
+    config = {"phase": "zero-shot", "arm": "epistemic", "tag": "short"}
+    write_run(folder, rows, **config, task_planner={"horizon": 2})
+    text, again = report_of(out)
+    assert again == table and "Other attempts" not in before
+    assert "| short | epistemic | 3 | 0 1 2 | 60 ± 26<br>[" in text
+    assert "Unequal settings" not in text
+
+
+def test_a_task_alone_does_not_count_beside_all(out):
+    run = out / "laptop-epistemic"
+    rows = [
+        row for row in zero_shot_rows("epistemic", [1.0]) if row["task"] == "forward"
+    ]
+    config = {"phase": "zero-shot", "arm": "epistemic"}
+    write_run(run / "zero-shot-003-forward", rows, task="forward", **config)
+    _, table = report_of(out)
+    assert table["epistemic"]["forward"]["seeds"] == [400.0, 500.0, 900.0]
+    (run / "zero-shot-003" / "metrics.jsonl").unlink()
+    _, table = report_of(out)
+    assert table["epistemic"]["forward"]["seeds"] == [1.0]
+
+
+def test_a_run_that_is_called_all_counts(out):
+    rows = [{**row, "seed": 7} for row in explore_rows("epistemic", [0])]
+    write_run(out / "laptop-epistemic-all", rows, phase="explore", task="all")
+    assert {row.seed for row in load(out) if row.arm == "epistemic"} == {0, 1, 2, 7}
+
+
+def test_report_says_what_is_missing(out):
+    text, _ = report_of(out)
+    assert "no log of random, oracle." in text
+    assert "no fine-tuning after 3 trials of epistemic" in text
+    log = out / "laptop-count" / "zero-shot-003" / "metrics.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if '"backward"' not in line]
+    log.write_text("".join(line for line in kept if '"seed": 2' not in line))
+    text, table = report_of(out)
+    assert "`count-16` has no zero-shot after 3 trials on backward." in text
+    assert "`count-16` has no zero-shot after 3 trials on forward of seeds 2." in text
+    assert "backward" not in table["count-16"]
+    assert len(table["count-16"]["forward"]["seeds"]) == 2
+    log.unlink()
+    text, table = report_of(out)
+    assert list(table) == ["epistemic"]
+    assert "on forward, backward, front-flip, back-flip." in text
+
+
+def test_exploration_alone_makes_a_report(tmp_path):
+    write_run(
+        tmp_path / "a", explore_rows("random", [0]), phase="explore", arm="random"
+    )
+    text, table = report_of(tmp_path)
+    assert table == {}
+    assert "No zero-shot log." in text
+    assert "No fine-tuning log." in text
+    assert "`random`: explored 3 trials (seeds 0)." in text
+
+
+def test_one_seed_has_no_interval(tmp_path):
+    write_arm(tmp_path, "epistemic", [250.0])
+    text, table = report_of(tmp_path)
+    entry = table["epistemic"]["forward"]
+    assert entry == {"seeds": [250.0], "mean": 250.0, "iqm": 250.0, "ci95": None}
+    assert "| forward | 250 (1 seed) |" in text
+
+
+def test_paper_numbers_stand_beside_the_preset_paper(tmp_path):
+    write_arm(tmp_path, "epistemic", [1.0], preset="paper")
+    write_arm(tmp_path, "epistemic", [2.0], preset="smoke")
+    written = write_report(tmp_path, tmp_path / "report")
+    names = {path.name for path in written}
+    assert {"report.md", "table1.json", "report-smoke.md", "table1-smoke.json"} < names
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| front-flip | 21 (1 seed) | 5916 | 1561 | 129 | 2532 |" in text
+    other = json.loads((tmp_path / "report" / "table1-smoke.json").read_text())
+    assert other["epistemic"]["forward"]["mean"] == 2.0
+
+
+def test_data_efficiency_is_a_table_of_its_own(out):
+    rows = zero_shot_rows("epistemic", [50.0, 60.0, 70.0], explored=1)
+    folder = out / "laptop-epistemic" / "zero-shot-001"
+    write_run(folder, rows, phase="zero-shot", arm="epistemic")
+    text, table = report_of(out)
+    assert "| epistemic | 1 | 60 ± 10 (3 seeds) |" in text
+    assert table["epistemic"]["forward"]["mean"] == 600.0
+
+
+def test_the_ablation_is_a_table_of_means_over_seeds_and_trials(out):
+    assert "## Ablation" not in report_of(out)[0]
+    returns = {
+        task: [[10.0 * i, 20.0], [30.0, 40.0]] for i, task in enumerate(TASK_NAMES)
+    }
+    row = {
+        "exploration": "curiosity",
+        "refit": "none",
+        "search": "CEM",
+        "seeds": [8, 9],
+    }
+    (out / "ablation.jsonl").write_text(json.dumps(row | {"returns": returns}) + "\n")
+    text, table = report_of(out)
+    assert "| curiosity | none | CEM | 8 9 | 22 | 25 | 28 | 30 |" in text
+    assert "curiosity" not in json.dumps(table)
+
+
+def test_null_returns_are_left_out_and_counted(out):
+    def lose(row):
+        if row["task"] == "forward" and (row["seed"] == 2 or row["trial"] == 1):
+            row["return"] = None
+
+    edit_rows(out / "laptop-epistemic" / "zero-shot-003" / "metrics.jsonl", lose)
+    text, table = report_of(out)
+    entry = table["epistemic"]["forward"]
+    assert entry["seeds"] == [393.0, 493.0, None]
+    assert entry["mean"] == 443.0
+    assert "`epistemic`: 4 of 24 returns of zero-shot are not finite" in text
+    assert "| epistemic | 2 | not finite | 910 |" in text
+
+    def lose_all(row):
+        row["returns"] = dict.fromkeys(TASK_NAMES)
+
+    edit_rows(out / "laptop-epistemic" / "metrics.jsonl", lose_all)
+    text, _ = report_of(out)
+    assert "36 of 36 returns of explore" in text
+
+
+def test_runs_of_other_seeds_are_pooled(out):
+    rows = [
+        {**row, "seed": row["seed"] + 3}
+        for row in zero_shot_rows("epistemic", [600.0, 700.0])
+    ]
+    folder = out / "more" / "zero-shot-003"
+    write_run(folder, rows, phase="zero-shot", arm="epistemic", learning_rate=0.5)
+    other = out / "laptop-epistemic" / "zero-shot-003" / "config.json"
+    config = json.loads(other.read_text())
+    other.write_text(json.dumps({**config, "learning_rate": 0.1}))
+    text, table = report_of(out)
+    seeds = table["epistemic"]["forward"]["seeds"]
+    assert seeds == [400.0, 500.0, 900.0, 600.0, 700.0]
+    # Of five, one is cut off at each end.
+    assert table["epistemic"]["forward"]["iqm"] == pytest.approx(600.0)
+    assert "learning_rate is 0.1 (laptop-epistemic); 0.5 (more)" in text
+
+
+def test_a_setting_that_a_run_did_not_record_is_named(tmp_path):
+    for arm, refit in (("count", {"bootstrap": True}), ("best", {"bootstrap": False})):
+        write_arm(tmp_path / "runs", arm, [1.0], refit=refit)
+    write_arm(tmp_path / "runs", "random", [1.0])
+    text, _ = report_of(tmp_path / "runs")
+    assert (
+        "zero-shot: refit.bootstrap is False (laptop-best); True (laptop-count" in text
+    )
+    assert "); not recorded (laptop-random)." in text
+
+
+def test_what_a_phase_does_not_use_may_differ_in_it(tmp_path):
+    for arm, horizon in (("epistemic", 20), ("best", 30)):
+        write_arm(tmp_path / "runs", arm, [1.0], task_planner={"horizon": horizon})
+    text, _ = report_of(tmp_path / "runs")
+    assert "Unequal settings in zero-shot: task_planner.horizon is" in text
+    assert "Unequal settings in explore" not in text
+
+
+def test_a_seed_in_two_runs_is_an_error(out):
+    rows = zero_shot_rows("epistemic", [1.0])
+    write_run(out / "again" / "zero-shot", rows, phase="zero-shot", arm="epistemic")
+    with pytest.raises(UsageError, match=r"both hold trial 1 of seed 0, task forward"):
+        load(out)
+
+
+def test_a_line_cut_off_is_left_out_and_a_damaged_one_is_an_error(out):
+    log = out / "laptop-count" / "metrics.jsonl"
+    whole = log.read_text()
+    log.write_text(whole[:-20])
+    text, _ = report_of(out)
+    assert "last line of laptop-count/metrics.jsonl is cut off" in text
+    assert "explored 3 trials (seeds 0, 1) and 2 trials (seeds 2)" in text
+    log.write_text("{]\n" + whole)
+    with pytest.raises(UsageError, match=r"metrics\.jsonl:1 is no row"):
+        load(out)
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_no_log_is_an_error(tmp_path, made):
+    out = tmp_path / "runs"
+    if made:
+        (out / ".hidden").mkdir(parents=True)
+        (out / ".hidden" / "metrics.jsonl").write_text("{}\n")
+    with pytest.raises(UsageError, match="no metrics"):
+        write_report(out, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
+def test_figures_show_something(out):
+    from PIL import Image
+
+    paths = write_report(out, out / "report")
+    pictures = [path for path in paths if path.suffix == ".png"]
+    assert len(pictures) == 2
+    # Colours of the arms: epistemic's blue, count's vermillion.
+    for path in pictures:
+        pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+        for color in ([0x00, 0x72, 0xB2], [0xD5, 0x5E, 0x00]):
+            assert (pixels == color).all(axis=-1).sum() > 200
