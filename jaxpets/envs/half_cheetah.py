@@ -141,7 +141,8 @@ def model_space() -> ModelSpace:
 
 def load_model() -> Any:
     """Returns gymnasium's HalfCheetah as a compiled MuJoCo model."""
-    assets = importlib.resources.files("gymnasium.envs.mujoco") / "assets"
+    # By way of the package: its module of MuJoCo environments imports a renderer.
+    assets = importlib.resources.files("gymnasium") / "envs/mujoco/assets"
     root = ElementTree.fromstring((assets / "half_cheetah.xml").read_text())
     compiler, geom = root.find("compiler"), root.find("default/geom")
     assert compiler is not None and geom is not None
