@@ -153,7 +153,7 @@ def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> 
     engine, precision = ("kernel", own) if name == "kernel" else ("scan", name)
     rollout = workloads.rollout_fn(size, precision, engine)
     rewards: dict[str, tuple[Any, Any]] = {
-        "epistemic": (jaxpets.rewards.epistemic, jaxpets.max_variance(params)),
+        "epistemic": (jaxpets.rewards.epistemic, jaxpets.rewards.max_variance(params)),
     } | {
         task: (half_cheetah.task_reward, half_cheetah.task(task))
         for task in half_cheetah.TASK_NAMES
@@ -164,13 +164,15 @@ def imagine(params: jaxpets.EnsembleParams, size: workloads.Size, name: str) -> 
     ) -> tuple[Array, dict[str, Array]]:
         path = rollout(params, key, obs, actions)
 
-        def score(objective_fn: jaxpets.ObjectiveFn, key: Array, state: tuple) -> Any:
+        def score(
+            objective_fn: jaxpets.optimizers.ObjectiveFn, key: Array, state: tuple
+        ) -> Any:
             values = objective_fn(key, actions)
-            return jaxpets.Solution(actions[0], values[0]), values
+            return jaxpets.optimizers.Solution(actions[0], values[0]), values
 
-        def values(reward_fn: jaxpets.RewardFn, weights: Any) -> Array:
+        def values(reward_fn: jaxpets.typing.RewardFn, weights: Any) -> Array:
             """What a planner that has imagined the path sees of the candidates."""
-            search = jaxpets.TrajectoryOptimizer(tuple, score)
+            search = jaxpets.optimizers.TrajectoryOptimizer(tuple, score)
             planner = jaxpets.plan(lambda *_: path, reward_fn, search)
             return planner.step(jaxpets.PlanParams(None, weights), key, (), obs)[1]
 

@@ -106,7 +106,7 @@ def build_ours(args: argparse.Namespace, num_epochs: int) -> tuple[Any, Any]:
         action_size=half_cheetah.ACTION_SIZE,
     )
     config = jaxpets.FitConfig(num_epochs=num_epochs, batch_size=args.batch_size)
-    return model, jaxpets.fit(model, optax.adam(1e-3), config)
+    return model, jaxpets.fitter(model, optax.adam(1e-3), config)
 
 
 def as_dataset(arrays: real_data.Arrays) -> Any:
@@ -117,8 +117,8 @@ def as_dataset(arrays: real_data.Arrays) -> Any:
 
     data = jaxpets.Transition(**{k: jnp.asarray(v) for k, v in arrays.items()})
     capacity, obs_size = data.obs.shape
-    empty = jaxpets.init_dataset(capacity, obs_size, data.action.shape[1])
-    return jaxpets.append(empty, data)
+    empty = jaxpets.datasets.init(capacity, obs_size, data.action.shape[1])
+    return jaxpets.datasets.append(empty, data)
 
 
 def train_ours(

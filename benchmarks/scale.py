@@ -70,7 +70,7 @@ def candidates(
     search = workloads.optimizer(size, "cem", args.engine)
     whole = jaxpets.plan(rollout, jaxpets.rewards.epistemic, search)
     parted = jaxpets.plan(
-        rollout, jaxpets.rewards.epistemic, jaxpets.sharded(search, AXIS)
+        rollout, jaxpets.rewards.epistemic, jaxpets.optimizers.sharded(search, AXIS)
     )
     inputs = jax.jit(workloads.plan_inputs(size, whole))(jax.random.key(0))
     one, _ = timing.compile_program(plan.in_turn(whole, args.plans), *inputs)

@@ -65,7 +65,7 @@ def time_unroll(
 
     def act(params: jaxpets.PlanParams, key: jax.Array) -> jaxpets.Transition:
         reset_key, act_key = jax.random.split(key)
-        state = jaxpets.start(env, planner, reset_key)
+        state = jaxpets.start_trial(env, planner, reset_key)
         return jaxpets.unroll(env, planner, params, act_key, state, length=steps)[1]
 
     return timing.measure(jax.vmap(act), params, keys, repeats=repeats)

@@ -86,7 +86,7 @@ def ensemble_config(size: Size, precision: str) -> jaxpets.EnsembleConfig:
     return jaxpets.EnsembleConfig(
         num_members=size.num_members,
         hidden_sizes=size.hidden_sizes,
-        weight_decays=(1e-4,) * (len(size.hidden_sizes) + 1),  # as good as any for time
+        weight_decays=1e-4,  # as good as any for time
         precision=jaxpets.Precision(precision),
     )
 
@@ -101,7 +101,9 @@ def model(size: Size, precision: str) -> jaxpets.Ensemble:
     )
 
 
-def rollout_fn(size: Size, precision: str, engine: str = "scan") -> jaxpets.RolloutFn:
+def rollout_fn(
+    size: Size, precision: str, engine: str = "scan"
+) -> jaxpets.typing.RolloutFn:
     """Returns the particle rollout of the ensemble.
 
     Raises:
@@ -131,7 +133,7 @@ def rollout_fn(size: Size, precision: str, engine: str = "scan") -> jaxpets.Roll
 
 def rollout_work(
     size: Size, precision: str, engine: str = "scan"
-) -> tuple[jaxpets.RolloutFn, tuple]:
+) -> tuple[jaxpets.typing.RolloutFn, tuple]:
     """Returns the rollout of one iteration of planning, and what it is called with."""
     params_key, action_key, key = jax.random.split(jax.random.key(0), 3)
     start = jax.jit(lambda key: params(size, key))(params_key)
@@ -143,12 +145,12 @@ def rollout_work(
 
 def optimizer(
     size: Size, name: str, engine: str = "scan"
-) -> jaxpets.TrajectoryOptimizer:
+) -> jaxpets.optimizers.TrajectoryOptimizer:
     """Returns `cem` or `icem` at this size, as the experiment has it for the engine."""
     one = jnp.ones((half_cheetah.ACTION_SIZE,), jnp.float32)
     unroll = engine == "kernel" and jax.default_backend() == "gpu"
-    cem = functools.partial(jaxpets.cem, unroll=unroll)
-    build = {"cem": cem, "icem": jaxpets.icem}[name]
+    cem = functools.partial(jaxpets.optimizers.cem, unroll=unroll)
+    build = {"cem": cem, "icem": jaxpets.optimizers.icem}[name]
     return build(
         horizon=size.horizon,
         action_low=-one,
@@ -183,7 +185,7 @@ def planner(
 def fitter(size: Size, num_epochs: int = 5, batch_size: int = 32) -> jaxpets.Fitter:
     """Returns the trainer of PETS, in TF32 where the hardware has it."""
     config = jaxpets.FitConfig(num_epochs=num_epochs, batch_size=batch_size)
-    return jaxpets.fit(model(size, "tf32"), optax.adam(1e-3), config)
+    return jaxpets.fitter(model(size, "tf32"), optax.adam(1e-3), config)
 
 
 def transitions(key: Array, num_rows: int) -> jaxpets.Transition:
@@ -198,12 +200,12 @@ def transitions(key: Array, num_rows: int) -> jaxpets.Transition:
     return jaxpets.Transition(obs, action, obs + change)
 
 
-def dataset(key: Array, num_rows: int, capacity: int) -> jaxpets.Dataset:
+def dataset(key: Array, num_rows: int, capacity: int) -> jaxpets.datasets.Dataset:
     """Returns a dataset with `num_rows` drawn transitions."""
-    empty = jaxpets.init_dataset(
+    empty = jaxpets.datasets.init(
         capacity, half_cheetah.OBS_SIZE, half_cheetah.ACTION_SIZE
     )
-    return jaxpets.append(empty, transitions(key, num_rows))
+    return jaxpets.datasets.append(empty, transitions(key, num_rows))
 
 
 def params(size: Size, key: Array) -> jaxpets.EnsembleParams:
@@ -217,7 +219,7 @@ def params(size: Size, key: Array) -> jaxpets.EnsembleParams:
 
 def prepare_fit(
     size: Size, fitter: jaxpets.Fitter, keys: Array, num_rows: int, capacity: int
-) -> tuple[jaxpets.EnsembleParams, jaxpets.FitState, jaxpets.Dataset]:
+) -> tuple[jaxpets.EnsembleParams, jaxpets.typing.FitState, jaxpets.datasets.Dataset]:
     """Returns what a fitter reads, one of each per key."""
 
     def prepare(key: Array) -> tuple:
@@ -225,15 +227,17 @@ def prepare_fit(
         start = params(size, model_key)
         return start, fitter.init(start), dataset(data_key, num_rows, capacity)
 
-    axes = (0, 0, jaxpets.DATASET_AXES)
+    axes = (0, 0, jaxpets.datasets.AXES)
     return jax.jit(jax.vmap(prepare, out_axes=axes))(keys)
 
 
 def fit_seeds(fitter: jaxpets.Fitter) -> Callable[..., Any]:
     """Returns `fitter.step` mapped over seeds with equally many rows."""
-    many = jax.vmap(fitter.step, (0, 0, 0, jaxpets.DATASET_AXES))
+    many = jax.vmap(fitter.step, (0, 0, 0, jaxpets.datasets.AXES))
 
-    def step(params: Any, keys: Array, state: Any, data: jaxpets.Dataset) -> Any:
+    def step(
+        params: Any, keys: Array, state: Any, data: jaxpets.datasets.Dataset
+    ) -> Any:
         if len(keys) > 1:
             return many(params, keys, state, data)
         # An axis of one would cost a third more, and nobody trains one seed so.
@@ -248,7 +252,7 @@ def plan_params(size: Size, key: Array, reward: str) -> jaxpets.PlanParams:
     dynamics = params(size, key)
     if reward == "task":
         return jaxpets.PlanParams(dynamics, half_cheetah.task("forward"))
-    return jaxpets.PlanParams(dynamics, jaxpets.max_variance(dynamics))
+    return jaxpets.PlanParams(dynamics, jaxpets.rewards.max_variance(dynamics))
 
 
 def plan_inputs(

@@ -141,11 +141,11 @@ def _one(
     """Returns `start` and `chunk` of one actor."""
 
     def chunk(
-        params: jaxpets.PlanParams, key: Array, state: jaxpets.UnrollState
-    ) -> tuple[jaxpets.UnrollState, jaxpets.Transition, Array]:
+        params: jaxpets.PlanParams, key: Array, state: jaxpets.typing.UnrollState
+    ) -> tuple[jaxpets.typing.UnrollState, jaxpets.Transition, Array]:
         state, transitions, plans = jaxpets.unroll(
             env, planner, params, key, state, length=length
         )
         return state, transitions, plans.value / horizon
 
-    return functools.partial(jaxpets.start, env, planner), chunk
+    return functools.partial(jaxpets.start_trial, env, planner), chunk

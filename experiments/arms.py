@@ -13,7 +13,7 @@ from jaxpets.envs import half_cheetah
 class Arm(NamedTuple):
     """An exploration reward and the data it needs."""
 
-    reward_fn: jaxpets.RewardFn | None  # None acts at random
+    reward_fn: jaxpets.typing.RewardFn | None  # None acts at random
     reward_data: jaxpets.RewardData
 
 
@@ -44,7 +44,7 @@ def _epistemic(config: Config, model: jaxpets.Ensemble) -> Arm:
     del config, model
     data = jaxpets.RewardData(
         init=lambda key: jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32),
-        refresh=lambda _, params, dataset: jaxpets.max_variance(params),
+        refresh=lambda _, params, dataset: jaxpets.rewards.max_variance(params),
     )
     return Arm(jaxpets.rewards.epistemic, data)
 
@@ -53,7 +53,7 @@ def _count(config: Config, model: jaxpets.Ensemble) -> Arm:
     """#Exploration: one projection per seed, all states hashed anew after a trial."""
     del model
     size = half_cheetah.OBS_SIZE
-    nothing = jaxpets.init_dataset(1, size, half_cheetah.ACTION_SIZE)
+    nothing = jaxpets.datasets.init(1, size, half_cheetah.ACTION_SIZE)
 
     def init(key: Array) -> jaxpets.rewards.PseudoCounts:
         projection = jaxpets.rewards.simhash(key, config.num_bits, size)
@@ -104,6 +104,6 @@ def _best(config: Config, model: jaxpets.Ensemble) -> Arm:
     del config, model
     data = jaxpets.RewardData(
         init=lambda key: jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32),
-        refresh=lambda _, params, dataset: jaxpets.obs_variance(dataset),
+        refresh=lambda _, params, dataset: jaxpets.datasets.obs_variance(dataset),
     )
     return Arm(jaxpets.rewards.epistemic, data)

@@ -26,11 +26,6 @@ ENGINES = {
 }
 
 
-# A learner over seeds: all have equally many transitions.
-_MAPPED: Any = 0
-LEARNER_AXES = jaxpets.LearnerState(_MAPPED, _MAPPED, jaxpets.DATASET_AXES, _MAPPED)
-
-
 class Parts(NamedTuple):
     """What the phases are made of. Nothing here is jitted."""
 
@@ -51,7 +46,6 @@ def build(config: Config) -> Parts:
     size = jaxpets.EnsembleConfig(
         num_members=numbers.num_members,
         hidden_sizes=(numbers.hidden_size,) * numbers.num_layers,
-        weight_decays=_weight_decays(numbers.num_layers),
         state_margin=numbers.state_margin,
     )
     trained = _ensemble(size, jaxpets.Precision.TF32)
@@ -60,7 +54,9 @@ def build(config: Config) -> Parts:
     explored = config.num_trials * config.trial_length
     finetuned = config.finetune_trials * config.task_length
 
-    def planner(reward_fn: jaxpets.RewardFn, search: PlannerNumbers) -> jaxpets.Planner:
+    def planner(
+        reward_fn: jaxpets.typing.RewardFn, search: PlannerNumbers
+    ) -> jaxpets.Planner:
         rollout = _rollout(size, search)
         is_kernel = hasattr(rollout, "bind")  # and not the scan in its place
         unroll = is_kernel and jax.default_backend() == "gpu"
@@ -95,27 +91,6 @@ def build(config: Config) -> Parts:
     )
 
 
-def over_seeds(learn: Learn, num_seeds: int) -> Learn:
-    """Maps a Learn, as `Learner.learn`, over one more leading axis of everything.
-
-    An axis of one is left out: XLA does not simplify gathers over it, and training
-    would take a third longer on a GPU.
-    """
-    if num_seeds > 1:
-        return jax.vmap(learn, (0, LEARNER_AXES, 0), (LEARNER_AXES, 0))
-
-    def learn_one(keys: Array, state: State, transitions: Any) -> Any:
-        state, transitions = jax.tree.map(
-            lambda x: x[0] if x.ndim else x, (state, transitions)
-        )
-        state, fit = learn(keys[0], state, transitions)
-        sizes = {name: getattr(state.dataset, name) for name in ("size", "cursor")}
-        state, fit = jax.tree.map(lambda x: x[None], (state, fit))
-        return state._replace(dataset=state.dataset._replace(**sizes)), fit
-
-    return learn_one
-
-
 def trial_keys(config: Config, phase: int, trial: int) -> Array:
     """Returns one key per seed `[S]` for one trial of one phase."""
 
@@ -129,7 +104,7 @@ def _fitter(ensemble: jaxpets.Ensemble, numbers: TrainingNumbers) -> jaxpets.Fit
     size = jaxpets.FitConfig(
         numbers.num_epochs, numbers.batch_size, numbers.final_rate, numbers.bootstrap
     )
-    return jaxpets.fit(ensemble, optax.adam(numbers.learning_rate), size)
+    return jaxpets.fitter(ensemble, optax.adam(numbers.learning_rate), size)
 
 
 def _ensemble(
@@ -143,7 +118,9 @@ def _ensemble(
     )
 
 
-def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.RolloutFn:
+def _rollout(
+    size: jaxpets.EnsembleConfig, search: PlannerNumbers
+) -> jaxpets.typing.RolloutFn:
     precision = jaxpets.Precision(search.precision)
     may_have_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
     if search.fused and may_have_kernel.get(jax.default_backend(), False):
@@ -161,16 +138,9 @@ def _rollout(size: jaxpets.EnsembleConfig, search: PlannerNumbers) -> jaxpets.Ro
     )
 
 
-def _weight_decays(num_layers: int) -> tuple[float, ...]:
-    """Spreads the decays of PETS, given for four hidden layers, over any number."""
-    first, second, *middle, last = jaxpets.EnsembleConfig().weight_decays
-    inner = (second, *(middle[0],) * num_layers)[: num_layers - 1]
-    return (first, *inner, last)
-
-
 def optimizer(
     numbers: PlannerNumbers, env: jaxpets.Env, unroll: bool = False
-) -> jaxpets.TrajectoryOptimizer:
+) -> jaxpets.optimizers.TrajectoryOptimizer:
     """Returns the search that the numbers describe; unroll is that of `cem`."""
     size = {
         "horizon": numbers.horizon,
@@ -180,8 +150,10 @@ def optimizer(
         "num_iterations": numbers.num_iterations,
     }
     if numbers.optimizer == "mppi":
-        return jaxpets.mppi(**size, temperature=numbers.temperature)
+        return jaxpets.optimizers.mppi(**size, temperature=numbers.temperature)
     size |= {"num_elites": numbers.num_elites, "momentum": numbers.momentum}
     if numbers.optimizer == "icem":
-        return jaxpets.icem(**size, noise_beta=numbers.noise_beta)
-    return jaxpets.cem(**size, legacy_variance=numbers.legacy_variance, unroll=unroll)
+        return jaxpets.optimizers.icem(**size, noise_beta=numbers.noise_beta)
+    return jaxpets.optimizers.cem(
+        **size, legacy_variance=numbers.legacy_variance, unroll=unroll
+    )

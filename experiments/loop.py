@@ -10,9 +10,10 @@ import jax
 from jax import Array
 from jax.sharding import PartitionSpec as P
 
+import jaxpets
 from experiments import acting, records
 from experiments.acting import Tick, Trials
-from experiments.build import LEARNER_AXES, Learn, State, over_seeds
+from experiments.build import Learn, State
 from experiments.config import Config
 from experiments.parallel import devices, distributed
 from experiments.parallel.devices import Spread
@@ -113,13 +114,18 @@ def restore(
 
 def learner(spread: Spread, learn: Learn, *axes: str) -> Learn:
     """Returns a learner over `axes`, jitted, with its share of them on every device."""
+    mapped = jaxpets.Learner(_never, learn, _never)
     for axis in reversed(axes):
-        learn = over_seeds(learn, devices.each(spread, axis))
+        mapped = jaxpets.over_seeds(mapped, devices.each(spread, axis))
     every, shared = P(*axes), P()
     state = jax.tree.map(
         lambda axis: shared if axis is None else every,
-        LEARNER_AXES,
+        jaxpets.SEED_AXES,
         is_leaf=lambda axis: axis is None,
     )
-    learn = devices.split(spread, learn, (every, state, every), (state, every))
+    learn = devices.split(spread, mapped.learn, (every, state, every), (state, every))
     return jax.jit(learn, donate_argnums=1)
+
+
+def _never(*_: Any) -> Any:
+    raise NotImplementedError

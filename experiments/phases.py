@@ -19,7 +19,6 @@ from experiments.acting import Tick, Trials
 from experiments.build import (
     EXPLORE,
     FINETUNE,
-    LEARNER_AXES,
     ZERO_SHOT,
     Parts,
     State,
@@ -65,7 +64,7 @@ def explore(config: Config, folder: Path, say: Say) -> None:
 
     learn = loop.learner(spread, parts.learner.learn, SEED)
     keys = lambda trial: trial_keys(config, EXPLORE, trial)  # noqa: E731
-    init = jax.jit(jax.vmap(parts.learner.init, out_axes=LEARNER_AXES))(keys(0))
+    init = jax.jit(jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES))(keys(0))
     own = Loop(
         "explore", config.trial_length, spread, (SEED,), keys, act, learn, labels
     )
@@ -216,7 +215,7 @@ def _explored(
 
 def explored_template(config: Config, parts: Parts) -> State:
     """Returns what exploration saves, `[S]`, as shapes."""
-    init = jax.vmap(parts.learner.init, out_axes=LEARNER_AXES)
+    init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
     return jax.eval_shape(init, trial_keys(config, EXPLORE, 0))
 
 
@@ -232,8 +231,8 @@ def data_of(state: State) -> State:
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:
     """Copies the learner `[S]` once per task, `[S, K]`, with room for more data."""
-    axes = LEARNER_AXES.dataset
-    grown = jax.vmap(lambda data: jaxpets.grow(data, capacity), (axes,), axes)
+    axes = jaxpets.SEED_AXES.dataset
+    grown = jax.vmap(lambda data: jaxpets.datasets.grow(data, capacity), (axes,), axes)
     state = state._replace(dataset=grown(state.dataset), reward=())
 
     def repeat(x: Array) -> Array:

@@ -1,58 +1,56 @@
-"""Model-based reinforcement learning that explores without a reward, in JAX."""
+"""Model-based reinforcement learning that explores without a reward, in JAX.
 
-from jaxpets import rewards
-from jaxpets._src.cem import CEMState, cem
-from jaxpets._src.dataset import (
-    DATASET_AXES,
-    append,
-    grow,
-    init_dataset,
-    obs_variance,
-)
-from jaxpets._src.ensemble import (
-    Ensemble,
-    EnsembleConfig,
-    EnsembleParams,
-    Precision,
-    delta_space,
-    ensemble,
-    max_variance,
-)
-from jaxpets._src.fit import FitConfig, FitMetrics, FitState, Fitter, fit
+Functions named by a noun build: they take functions, sizes and options, and return a
+record of pure functions, such as a Planner with `init` and `step`. Functions named by a
+verb act. (`plan` builds too: a rollout, a reward and a search become a planner.)
+Nothing is jitted, keeps state or draws from a global key. All arrays are float32, and
+all keys typed (`jax.random.key`).
+
+The shapes in the docstrings have these letters:
+
+  N  candidate action sequences (num_samples)
+  H  planning horizon
+  E  ensemble members
+  P  particles per member (num_particles = E * P)
+  B  rows of one member's batch; N * P inside a rollout
+  D  observation size
+  F  size of what the network reads of an observation
+  A  action size
+  T  environment steps
+  C  dataset capacity
+  S  seeds
+
+Members come first, then rows: `[E, B, ...]`. A reward sees the particles of one
+candidate at one step, `[E, P, D]`, and returns `[E, P]` or `[]`.
+"""
+
+from jaxpets import datasets, optimizers, rewards, typing
+from jaxpets._src.check_space import check_space
+from jaxpets._src.ensemble import Ensemble, delta_space, ensemble
+from jaxpets._src.ensemble_config import EnsembleConfig
+from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.fitter import FitConfig, FitMetrics, Fitter, fitter
 from jaxpets._src.fused_rollout import fused_rollout
-from jaxpets._src.icem import ICEMState, colored_noise, icem
-from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput, learner
-from jaxpets._src.mppi import MPPIState, mppi
+from jaxpets._src.learner import Learner, LearnerState, RewardData, learner
+from jaxpets._src.network import Precision
+from jaxpets._src.over_seeds import SEED_AXES, over_seeds
 from jaxpets._src.plan import plan, random_planner
 from jaxpets._src.rollout import particle_rollout
-from jaxpets._src.sharded import sharded
 from jaxpets._src.types import (
-    WORST_VALUE,
-    Dataset,
-    DynamicsFn,
     Env,
     EnvState,
     ModelSpace,
-    ObjectiveFn,
     Planner,
     PlanOutput,
     PlanParams,
-    RewardFn,
-    RolloutFn,
-    Solution,
-    TrajectoryOptimizer,
     Transition,
 )
-from jaxpets._src.unroll import UnrollState, start, unroll
+from jaxpets._src.unroll import start_trial, unroll
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "DATASET_AXES",
-    "WORST_VALUE",
-    "CEMState",
-    "Dataset",
-    "DynamicsFn",
+    "SEED_AXES",
     "Ensemble",
     "EnsembleConfig",
     "EnsembleParams",
@@ -60,45 +58,30 @@ __all__ = [
     "EnvState",
     "FitConfig",
     "FitMetrics",
-    "FitState",
     "Fitter",
-    "ICEMState",
     "Learner",
     "LearnerState",
-    "MPPIState",
     "ModelSpace",
-    "ObjectiveFn",
     "PlanOutput",
     "PlanParams",
     "Planner",
     "Precision",
     "RewardData",
-    "RewardFn",
-    "RolloutFn",
-    "Solution",
-    "TrajectoryOptimizer",
     "Transition",
-    "TrialOutput",
-    "UnrollState",
-    "append",
-    "cem",
-    "colored_noise",
+    "check_space",
+    "datasets",
     "delta_space",
     "ensemble",
-    "fit",
+    "fitter",
     "fused_rollout",
-    "grow",
-    "icem",
-    "init_dataset",
     "learner",
-    "max_variance",
-    "mppi",
-    "obs_variance",
+    "optimizers",
+    "over_seeds",
     "particle_rollout",
     "plan",
     "random_planner",
     "rewards",
-    "sharded",
-    "start",
+    "start_trial",
+    "typing",
     "unroll",
 ]

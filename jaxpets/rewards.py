@@ -1,5 +1,6 @@
-"""Exploration rewards, all of them plain functions for `jaxpets.plan`."""
+"""Exploration rewards, plain functions for `jaxpets.plan`, and their data."""
 
+from jaxpets._src.ensemble_params import max_variance
 from jaxpets._src.pseudo_counts import (
     PseudoCounts,
     count_states,
@@ -20,6 +21,7 @@ __all__ = [
     "epistemic",
     "information_gain",
     "lookup",
+    "max_variance",
     "one_step_disagreement",
     "pessimistic",
     "pseudo_count",

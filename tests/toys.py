@@ -48,16 +48,16 @@ def cart_env(gain=1.0):
 
 
 OPTIMIZERS = {
-    "cem": lambda **box: jaxpets.cem(
+    "cem": lambda **box: jaxpets.optimizers.cem(
         num_samples=64, num_elites=8, num_iterations=3, **box
     ),
-    "cem-unrolled": lambda **box: jaxpets.cem(
+    "cem-unrolled": lambda **box: jaxpets.optimizers.cem(
         num_samples=64, num_elites=8, num_iterations=3, unroll=True, **box
     ),
-    "icem": lambda **box: jaxpets.icem(
+    "icem": lambda **box: jaxpets.optimizers.icem(
         num_samples=48, num_elites=6, num_iterations=2, **box
     ),
-    "mppi": lambda **box: jaxpets.mppi(
+    "mppi": lambda **box: jaxpets.optimizers.mppi(
         num_samples=64, num_iterations=4, temperature=0.1, **box
     ),
 }
@@ -78,12 +78,12 @@ def probe(actions):
     def step(objective_fn, key, state):
         del state
         values = objective_fn(key, actions)
-        return jaxpets.Solution(actions[0], values[0]), values
+        return jaxpets.optimizers.Solution(actions[0], values[0]), values
 
     def init():
         return jnp.zeros((actions.shape[0],), jnp.float32)
 
-    return jaxpets.TrajectoryOptimizer(init, step)
+    return jaxpets.optimizers.TrajectoryOptimizer(init, step)
 
 
 class Record(NamedTuple):
@@ -91,7 +91,7 @@ class Record(NamedTuple):
 
     actions: list  # per iteration `[N, H, A]`
     values: list  # per iteration `[N]`
-    solution: jaxpets.Solution
+    solution: jaxpets.optimizers.Solution
     state: Any
 
 
@@ -152,7 +152,9 @@ def transitions(length, obs_size=2, action_size=1, seed=0):
 def dataset_of(data, capacity=40):
     """A dataset that holds `data`."""
     obs_size, action_size = data.obs.shape[1], data.action.shape[1]
-    return jaxpets.append(jaxpets.init_dataset(capacity, obs_size, action_size), data)
+    return jaxpets.datasets.append(
+        jaxpets.datasets.init(capacity, obs_size, action_size), data
+    )
 
 
 def assert_trees_close(got, want, **tolerance):

@@ -56,7 +56,7 @@ def perform(args: Arguments) -> np.ndarray:
             planner,
             jaxpets.PlanParams((), weights),
             act_key,
-            jaxpets.start(env, planner, reset_key),
+            jaxpets.start_trial(env, planner, reset_key),
             length=args.trial_length,
             observe_fn=lambda state: state,
         )

@@ -5,29 +5,36 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
+from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
-    check_action_box,
     check_array,
     check_count,
     check_flag,
+    check_key,
     check_real,
+    check_record,
 )
 from jaxpets._src.elites import select_elites
-from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
 class CEMState(NamedTuple):
-    """The warm start: the mean of the next search."""
+    """The warm start of `cem`.
 
-    mean: Array  # [H, A]
+    Attributes:
+      mean: `[H, A]`, of the next search.
+    """
+
+    mean: Array
 
 
 def cem(
     *,
     horizon: int,
-    action_low: Array,
-    action_high: Array,
+    action_low: ArrayLike,
+    action_high: ArrayLike,
     num_samples: int = 500,
     num_elites: int = 50,
     num_iterations: int = 5,
@@ -77,7 +84,7 @@ def cem(
     True
     """
     check_count("horizon", horizon)
-    check_action_box(action_low, action_high)
+    box = action_box(action_low, action_high)
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
@@ -85,25 +92,25 @@ def cem(
     check_real("min_variance", min_variance, 0.0)
     check_flag("legacy_variance", legacy_variance)
     check_flag("unroll", unroll)
-    center = (action_low + action_high) / 2
-    half_width = (action_high - action_low) / 2
-    shape = (horizon, center.shape[0])
+    shape = (horizon, box.center.shape[0])
 
     def sample(key: Array, mean: Array, variance: Array) -> Array:
-        margin = jnp.minimum(mean - action_low, action_high - mean)
+        margin = jnp.minimum(mean - box.low, box.high - mean)
         std = jnp.minimum(jnp.sqrt(variance), margin / 2)
         noise = jax.random.truncated_normal(
             key, -2.0, 2.0, (num_samples, *shape), jnp.float32
         )
         # The clip only removes rounding: mean + 2 * std can pass the bound by one ulp.
-        return jnp.clip(mean + std * noise, action_low, action_high)
+        return box.clip(mean + std * noise)
 
     def init() -> CEMState:
-        return CEMState(mean=jnp.broadcast_to(center, shape))
+        return CEMState(mean=box.start(horizon))
 
     def step(
         objective_fn: ObjectiveFn, key: Array, state: CEMState
     ) -> tuple[Solution, CEMState]:
+        check_key("key", key)
+        check_record("state", state, CEMState)
         check_array("state.mean", state.mean, shape)
 
         def iterate(carry: tuple, keys: Array) -> tuple[tuple, None]:
@@ -112,27 +119,22 @@ def cem(
             actions = sample(sample_key, mean, variance)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [num_samples])
-            elites = select_elites(values, actions, num_elites, WORST_VALUE)
+            elites = select_elites(values, actions, num_elites)
             kept = 0.0 if legacy_variance else momentum
             new = (
-                jnp.clip(
-                    momentum * mean + (1 - momentum) * elites.mean,
-                    action_low,
-                    action_high,
-                ),
+                box.clip(momentum * mean + (1 - momentum) * elites.mean),
                 kept * variance + (1 - kept) * elites.variance,
                 elites.value,
             )
-            searching = jnp.max(variance / half_width**2) > min_variance
+            searching = jnp.max(variance / box.half_width**2) > min_variance
             return jax.tree.map(
                 lambda a, b: jnp.where(searching, a, b), new, carry
             ), None
 
-        variance = jnp.broadcast_to(half_width**2 / 4, shape)
+        variance = jnp.broadcast_to(box.half_width**2 / 4, shape)
         start = (state.mean, variance, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
         (mean, _, value), _ = jax.lax.scan(iterate, start, keys, unroll=bool(unroll))
-        shifted = jnp.concatenate([mean[1:], center[None]])
-        return Solution(actions=mean, value=value), CEMState(mean=shifted)
+        return Solution(actions=mean, value=value), CEMState(mean=box.shift(mean))
 
     return TrajectoryOptimizer(init, step)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
 
 def check_count(name: str, value: Any, minimum: int = 1) -> None:
@@ -58,6 +57,44 @@ def check_reals(name: str, values: Any, low: float) -> None:
         check_real(name, value, low)
 
 
+def check_record(name: str, value: Any, record: type) -> None:
+    """Raises unless `value` is an instance of `record`."""
+    if not isinstance(value, record):
+        kind = type(value).__name__
+        article = "an" if record.__name__[0] in "AEIOU" else "a"
+        raise TypeError(f"{name} must be {article} {record.__name__}, got {kind}.")
+
+
+def check_callable(name: str, value: Any) -> None:
+    """Raises unless `value` can be called."""
+    if not callable(value):
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be a function, got {value!r} ({kind}).")
+
+
+def check_like(name: str, value: Any, template: Any) -> None:
+    """Raises unless two pytrees agree in structure, shapes and dtypes.
+
+    Args:
+      name: of the value.
+      value: a pytree of arrays, concrete or traced.
+      template: a pytree of arrays or of `jax.ShapeDtypeStruct`s.
+    """
+    structure = jax.tree.structure(value)
+    wanted = jax.tree.structure(template)
+    if structure != wanted:
+        raise ValueError(f"{name} must have the structure {wanted}, got {structure}.")
+    leaves = jax.tree_util.tree_leaves_with_path(template)
+    for (path, want), got in zip(leaves, jax.tree.leaves(value), strict=True):
+        if _aval(got) != _aval(want):
+            leaf = f"{name}{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{leaf} must be {_aval(want)}, got {_aval(got)}.")
+
+
+def _aval(x: Any) -> str:
+    return f"{jnp.result_type(x)}{list(jnp.shape(x))}"
+
+
 def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> None:
     """Raises unless `value` is a float32 array of `shape`.
 
@@ -83,23 +120,6 @@ def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> Non
     dtype = jnp.result_type(value)
     if not fits or dtype != jnp.float32:
         raise ValueError(f"{name} must be float32[{text}], got {dtype}{list(got)}.")
-
-
-def check_action_box(action_low: Array, action_high: Array) -> None:
-    """Raises unless the two are `[A]`, finite and `low < high` in every entry."""
-    check_array("action_low", action_low, ["A"])
-    check_array("action_high", action_high, [jnp.shape(action_low)[0]])
-    if jnp.shape(action_low)[0] == 0:
-        raise ValueError("action_low must have at least one entry, got float32[0].")
-    bounds = (action_low, action_high)
-    if any(isinstance(bound, Tracer) for bound in bounds):
-        return
-    low, high = np.asarray(action_low), np.asarray(action_high)
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
-        raise ValueError(
-            "action_low and action_high must be finite with low < high, "
-            f"got {low.tolist()} and {high.tolist()}."
-        )
 
 
 def check_key(name: str, key: Any) -> None:

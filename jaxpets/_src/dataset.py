@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.checks import check_array, check_count, check_record
 from jaxpets._src.moments import moments
 from jaxpets._src.types import Dataset, Transition
 
@@ -14,10 +14,10 @@ _SHARED: Any = None
 # The axes of a dataset mapped over seeds which all have the same size. Shared, the size
 # is the trip count of one plain loop over batches; mapped, every step of that loop
 # would select between old and new parameters: a third more time on a GPU.
-DATASET_AXES = Dataset(data=_MAPPED, size=_SHARED, cursor=_SHARED)
+AXES = Dataset(data=_MAPPED, size=_SHARED, cursor=_SHARED)
 
 
-def init_dataset(capacity: int, obs_size: int, action_size: int) -> Dataset:
+def init(capacity: int, obs_size: int, action_size: int) -> Dataset:
     """Returns an empty dataset for C = `capacity` transitions.
 
     Args:
@@ -31,10 +31,13 @@ def init_dataset(capacity: int, obs_size: int, action_size: int) -> Dataset:
     check_count("capacity", capacity)
     check_count("obs_size", obs_size)
     check_count("action_size", action_size)
-    obs = jnp.zeros((capacity, obs_size), jnp.float32)
-    action = jnp.zeros((capacity, action_size), jnp.float32)
-    empty = jnp.zeros((), jnp.int32)
-    return Dataset(Transition(obs, action, obs), empty, empty)
+    # Every array is a buffer of its own, so that a caller may donate them all.
+    obs, action, next_obs = (
+        jnp.zeros((capacity, size), jnp.float32)
+        for size in (obs_size, action_size, obs_size)
+    )
+    size, cursor = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+    return Dataset(Transition(obs, action, next_obs), size, cursor)
 
 
 def append(dataset: Dataset, transitions: Transition) -> Dataset:
@@ -45,8 +48,10 @@ def append(dataset: Dataset, transitions: Transition) -> Dataset:
       transitions: `[T, D]`, `[T, A]`, `[T, D]`, T at most the capacity.
 
     Raises:
-      ValueError: if a width, a length or a dtype does not fit.
+      TypeError, ValueError: if a record, a width, a length or a dtype does not fit.
     """
+    check_record("dataset", dataset, Dataset)
+    check_record("transitions", transitions, Transition)
     capacity, obs_size = dataset.data.obs.shape
     check_array("transitions.obs", transitions.obs, ["T", obs_size])
     length = transitions.obs.shape[0]

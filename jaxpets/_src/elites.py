@@ -6,24 +6,33 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+# The value of a candidate whose return is not finite. Finite itself, so that means
+# over elites stay finite, and far below any return a task can give.
+WORST_VALUE = -1e30
+
 
 class Elites(NamedTuple):
-    """The best K of N candidates; the statistics leave out what was rejected."""
+    """The best K of N candidates; the statistics leave out what was rejected.
 
-    actions: Array  # [K, H, A], the best first
-    mean: Array  # [H, A]
-    variance: Array  # [H, A]
-    value: Array  # [] mean
+    Attributes:
+      actions: `[K, H, A]`, the best first.
+      mean: `[H, A]`.
+      variance: `[H, A]`.
+      value: `[]`, the mean of the elites' values.
+    """
+
+    actions: Array
+    mean: Array
+    variance: Array
+    value: Array
 
 
-def not_rejected(values: Array, worst: float) -> Array:
-    """Tells which of `values` `[N]` are better than the worst; if none is, all pass."""
-    return (values > worst) | jnp.all(values <= worst)
+def is_valid(values: Array) -> Array:
+    """Tells which of `values` `[N]` are above WORST_VALUE; if none is, all pass."""
+    return (values > WORST_VALUE) | jnp.all(values <= WORST_VALUE)
 
 
-def select_elites(
-    values: Array, actions: Array, num_elites: int, worst: float
-) -> Elites:
+def select_elites(values: Array, actions: Array, num_elites: int) -> Elites:
     """Selects the best candidates.
 
     A candidate whose imagined future is not finite is rejected: it has the worst value.
@@ -34,14 +43,13 @@ def select_elites(
       values: `[N]`, finite.
       actions: `[N, H, A]`.
       num_elites: K.
-      worst: value of what is rejected.
 
     Returns:
       Elites.
     """
     best, index = jax.lax.top_k(values, num_elites)
     elites = actions[index]
-    kept = not_rejected(best, worst).astype(jnp.float32)
+    kept = is_valid(best).astype(jnp.float32)
     share = kept / jnp.sum(kept)
     weight = share[:, None, None]
     mean = jnp.sum(weight * elites, axis=0)

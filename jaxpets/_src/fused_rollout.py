@@ -11,12 +11,9 @@ from jax import Array
 
 from jaxpets._src.checks import check_array, check_flag
 from jaxpets._src.chunks import WINDOW
-from jaxpets._src.ensemble import (
-    EnsembleConfig,
-    EnsembleParams,
-    ensemble,
-    imagined_range,
-)
+from jaxpets._src.ensemble import ensemble
+from jaxpets._src.ensemble_config import EnsembleConfig
+from jaxpets._src.ensemble_params import EnsembleParams, imagined_range
 from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
 from jaxpets._src.kernel.row_code import UnsupportedError, row_function
 from jaxpets._src.kernel.shape import KernelShape

@@ -5,30 +5,38 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
+from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
-    check_action_box,
     check_array,
     check_count,
     check_flag,
+    check_key,
     check_real,
+    check_record,
 )
 from jaxpets._src.elites import select_elites
-from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
 class ICEMState(NamedTuple):
-    """The warm start: the mean and the best sequences of the last search."""
+    """The warm start of `icem`.
 
-    mean: Array  # [H, A]
-    elites: Array  # [K, H, A], K sequences kept
+    Attributes:
+      mean: `[H, A]`, of the next search.
+      elites: `[K, H, A]`, the best sequences of the last search.
+    """
+
+    mean: Array
+    elites: Array
 
 
 def icem(
     *,
     horizon: int,
-    action_low: Array,
-    action_high: Array,
+    action_low: ArrayLike,
+    action_high: ArrayLike,
     num_samples: int = 64,
     num_elites: int = 10,
     num_iterations: int = 3,
@@ -69,7 +77,7 @@ def icem(
       TypeError, ValueError: for a size, number or bound that cannot be searched with.
     """
     check_count("horizon", horizon)
-    check_action_box(action_low, action_high)
+    box = action_box(action_low, action_high)
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
@@ -79,9 +87,7 @@ def icem(
     check_real("kept_fraction", kept_fraction, 0.0, 1.0)
     check_real("decay", decay, 1.0)
     check_flag("execute_best", execute_best)
-    center = (action_low + action_high) / 2
-    half_width = (action_high - action_low) / 2
-    shape = (horizon, center.shape[0])
+    shape = (horizon, box.center.shape[0])
     num_kept = round(kept_fraction * num_elites)
     smallest = min(num_samples, 2 * num_elites)
     populations = [
@@ -89,44 +95,45 @@ def icem(
     ]
 
     def init() -> ICEMState:
-        mean = jnp.broadcast_to(center, shape)
+        mean = box.start(horizon)
         # No sequence was found yet: the middle of the box stands in.
         return ICEMState(mean, jnp.broadcast_to(mean, (num_kept, *shape)))
 
     def step(
         objective_fn: ObjectiveFn, key: Array, state: ICEMState
     ) -> tuple[Solution, ICEMState]:
+        check_key("key", key)
+        check_record("state", state, ICEMState)
         mean, kept = state
         check_array("state.mean", mean, shape)
         check_array("state.elites", kept, [num_kept, *shape])
-        std = jnp.broadcast_to(init_std * half_width, shape)
+        std = jnp.broadcast_to(init_std * box.half_width, shape)
         keys = jax.random.split(key, (num_iterations, 2))
         best = value = None
         # A Python loop, because the population, a shape, shrinks.
         for i, population in enumerate(populations):
             sample_key, value_key = keys[i]
-            noise = colored_noise(sample_key, noise_beta, (population, *shape))
-            actions = jnp.clip(mean + std * noise, action_low, action_high)
+            noise = _colored_noise(sample_key, noise_beta, (population, *shape))
+            actions = box.clip(mean + std * noise)
             candidates = [actions, kept]
             if i == num_iterations - 1:
                 candidates.append(mean[None])
             actions = jnp.concatenate(candidates)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [actions.shape[0]])
-            elites = select_elites(values, actions, num_elites, WORST_VALUE)
-            mean = momentum * mean + (1 - momentum) * elites.mean
-            mean = jnp.clip(mean, action_low, action_high)
+            elites = select_elites(values, actions, num_elites)
+            mean = box.clip(momentum * mean + (1 - momentum) * elites.mean)
             std = momentum * std + (1 - momentum) * jnp.sqrt(elites.variance)
             kept, best = elites.actions[:num_kept], elites.actions[0]
             value = elites.value
         assert best is not None and value is not None
         solution = Solution(actions=best if execute_best else mean, value=value)
-        return solution, ICEMState(_shift(mean, center), _shift(kept, center))
+        return solution, ICEMState(box.shift(mean), box.shift(kept))
 
     return TrajectoryOptimizer(init, step)
 
 
-def colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
+def _colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
     """Draws Gaussian noise of unit variance, correlated along axis -2 (time).
 
     The power of frequency f is proportional to `1 / f^beta`; entries of the last axis
@@ -161,9 +168,3 @@ def colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
     std = jnp.sqrt(jnp.sum(weight)) / horizon
     noise = jnp.fft.irfft(jax.lax.complex(scale * real, scale * imaginary), horizon)
     return (noise / std).swapaxes(-1, -2).astype(jnp.float32)
-
-
-def _shift(sequences: Array, center: Array) -> Array:
-    """Drops the first step of `[..., H, A]` and pads with the middle of the box."""
-    last = jnp.broadcast_to(center, sequences[..., :1, :].shape)
-    return jnp.concatenate([sequences[..., 1:, :], last], axis=-2)

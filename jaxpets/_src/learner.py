@@ -3,31 +3,54 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import chex
 import jax
 from jax import Array
 
-from jaxpets._src.checks import check_count, check_key
-from jaxpets._src.dataset import append, init_dataset
-from jaxpets._src.ensemble import Ensemble, EnsembleParams
-from jaxpets._src.fit import FitMetrics, FitState, Fitter
-from jaxpets._src.types import Dataset, Env, Planner, PlanOutput, PlanParams, Transition
-from jaxpets._src.unroll import start, unroll
+from jaxpets._src import dataset as datasets
+from jaxpets._src.checks import check_count, check_key, check_like, check_record
+from jaxpets._src.ensemble import Ensemble
+from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.fitter import FitMetrics, FitState, Fitter
+from jaxpets._src.types import (
+    Dataset,
+    Env,
+    EnvState,
+    Planner,
+    PlanOutput,
+    PlanParams,
+    Transition,
+)
+from jaxpets._src.unroll import start_trial, unroll
 
 
 class RewardData(NamedTuple):
     """How the data of a reward come about; see `PlanParams.reward`.
 
-    init: `(key) -> data` before anything was seen.
-    refresh: `(data, EnsembleParams, Dataset) -> data`, once per trial.
+    By default a reward has no data: `()`.
+
+    Attributes:
+      init: `(key) -> data` before anything was seen.
+      refresh: `(data, EnsembleParams, Dataset) -> data`, once per trial.
     """
 
-    init: Callable[[Array], Any]
-    refresh: Callable[[Any, EnsembleParams, Dataset], Any]
+    init: Callable[[Array], Any] = lambda key: ()
+    refresh: Callable[[Any, EnsembleParams, Dataset], Any] = (
+        lambda data, params, dataset: data
+    )
+
+
+_NO_DATA = RewardData()
 
 
 class LearnerState(NamedTuple):
-    """Everything that was learned; holds no key."""
+    """Everything that was learned; holds no key.
+
+    Attributes:
+      params: the model.
+      fit: the state of its optimizer.
+      dataset: what was seen.
+      reward: the data of the exploration reward.
+    """
 
     params: EnsembleParams
     fit: FitState
@@ -36,21 +59,28 @@ class LearnerState(NamedTuple):
 
 
 class TrialOutput(NamedTuple):
-    """What happened in one trial."""
+    """What happened in one trial.
 
-    transitions: Transition  # [T, ...]
-    plans: PlanOutput  # [T, ...]
+    Attributes:
+      transitions: `[T, ...]`.
+      plans: PlanOutput `[T, ...]`.
+      fit: how training went after it.
+    """
+
+    transitions: Transition
+    plans: PlanOutput
     fit: FitMetrics
 
 
 class Learner(NamedTuple):
     """The loop of PETS, one trial at a time.
 
-    init: `(key) -> LearnerState`.
-    learn: `(key, state, transitions [T, ...]) -> (state, FitMetrics)`: appends, fits,
-      refreshes the reward data.
-    step: `(planner, key, state) -> (state, TrialOutput)`: resets the environment,
-      unrolls the planner and learns from what happened.
+    Attributes:
+      init: `(key) -> LearnerState`.
+      learn: `(key, state, transitions [T, ...]) -> (state, FitMetrics)`: appends, fits,
+        refreshes the reward data.
+      step: `(planner, key, state) -> (state, TrialOutput)`: resets the environment,
+        unrolls the planner and learns from what happened.
     """
 
     init: Callable[[Array], LearnerState]
@@ -62,14 +92,16 @@ def learner(
     env: Env,
     ensemble: Ensemble,
     fitter: Fitter,
-    reward_data: RewardData,
+    reward_data: RewardData = _NO_DATA,
     *,
     trial_length: int,
     capacity: int,
 ) -> Learner:
     """Builds the two halves of a trial, acting and learning (sections 3.1 to 3.3).
 
-    The planner is an argument of `step`, so the first trial may be a random one.
+    The planner is an argument of `step`, so the first trial may be a random one. A
+    jitted trial is `jax.jit(learner.step, static_argnums=0)`, and many seeds are
+    `jaxpets.over_seeds(learner, num_seeds)`.
 
     Args:
       env: where to act.
@@ -80,42 +112,57 @@ def learner(
       capacity: C, transitions kept.
 
     Returns:
-      A Learner; map it over seeds with `jax.vmap`.
+      A Learner.
 
     Raises:
-      TypeError, ValueError: if a trial does not fit the capacity.
-      AssertionError: from `learn`, when traced, if `refresh` changes a shape or dtype.
+      TypeError, ValueError: if an argument is not what it should be, a trial does not
+        fit the capacity, or the model does not fit the environment; from `learn`, when
+        traced, if `refresh` changes a shape or dtype.
     """
+    check_record("env", env, Env)
+    check_record("ensemble", ensemble, Ensemble)
+    check_record("fitter", fitter, Fitter)
+    check_record("reward_data", reward_data, RewardData)
     check_count("trial_length", trial_length)
     check_count("capacity", capacity, minimum=trial_length)
-    obs_size = jax.eval_shape(env.reset, jax.random.key(0)).obs.shape[0]
+    begin = jax.eval_shape(env.reset, jax.random.key(0))
+    check_record("env.reset's result", begin, EnvState)
+    sizes = (begin.obs.shape[-1], env.action_low.shape[0])
+    if sizes != (ensemble.obs_size, ensemble.action_size):
+        raise ValueError(
+            f"ensemble must have the sizes of env, obs_size {sizes[0]} and action_size "
+            f"{sizes[1]}, got {ensemble.obs_size} and {ensemble.action_size}."
+        )
 
     def init(key: Array) -> LearnerState:
         check_key("key", key)
         model_key, reward_key = jax.random.split(key)
         params = ensemble.init(model_key)
-        dataset = init_dataset(capacity, obs_size, env.action_low.shape[0])
+        dataset = datasets.init(capacity, *sizes)
         reward = reward_data.refresh(reward_data.init(reward_key), params, dataset)
         return LearnerState(params, fitter.init(params), dataset, reward)
 
     def learn(
         key: Array, state: LearnerState, transitions: Transition
     ) -> tuple[LearnerState, FitMetrics]:
-        dataset = append(state.dataset, transitions)
+        check_record("state", state, LearnerState)
+        dataset = datasets.append(state.dataset, transitions)
         params, fit, metrics = fitter.step(state.params, key, state.fit, dataset)
         reward = reward_data.refresh(state.reward, params, dataset)
         # Another shape would retrace every trial.
-        chex.assert_trees_all_equal_shapes_and_dtypes(reward, state.reward)
+        check_like("reward_data.refresh's result", reward, state.reward)
         return LearnerState(params, fit, dataset, reward), metrics
 
     def step(
         planner: Planner, key: Array, state: LearnerState
     ) -> tuple[LearnerState, TrialOutput]:
+        check_key("key", key)
+        check_record("state", state, LearnerState)
         reset_key, act_key, fit_key = jax.random.split(key, 3)
         params = PlanParams(state.params, state.reward)
-        begin = start(env, planner, reset_key)
+        trial = start_trial(env, planner, reset_key)
         _, transitions, plans = unroll(
-            env, planner, params, act_key, begin, length=trial_length
+            env, planner, params, act_key, trial, length=trial_length
         )
         state, metrics = learn(fit_key, state, transitions)
         return state, TrialOutput(transitions, plans, metrics)

@@ -5,28 +5,35 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
+from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
-    check_action_box,
     check_array,
     check_count,
+    check_key,
     check_real,
+    check_record,
 )
-from jaxpets._src.elites import not_rejected
-from jaxpets._src.types import WORST_VALUE, ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.elites import is_valid
+from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
 class MPPIState(NamedTuple):
-    """The warm start: the mean of the next search."""
+    """The warm start of `mppi`.
 
-    mean: Array  # [H, A]
+    Attributes:
+      mean: `[H, A]`, of the next search.
+    """
+
+    mean: Array
 
 
 def mppi(
     *,
     horizon: int,
-    action_low: Array,
-    action_high: Array,
+    action_low: ArrayLike,
+    action_high: ArrayLike,
     num_samples: int = 500,
     num_iterations: int = 1,
     std: float = 0.5,
@@ -55,32 +62,33 @@ def mppi(
       TypeError, ValueError: for a size, number or bound that cannot be searched with.
     """
     check_count("horizon", horizon)
-    check_action_box(action_low, action_high)
+    box = action_box(action_low, action_high)
     check_count("num_samples", num_samples, minimum=2)
     check_count("num_iterations", num_iterations)
     check_real("std", std, 1e-6)
     check_real("temperature", temperature, 1e-6)
-    center = (action_low + action_high) / 2
-    scale = std * (action_high - action_low) / 2
-    shape = (horizon, center.shape[0])
+    scale = std * box.half_width
+    shape = (horizon, box.center.shape[0])
 
     def init() -> MPPIState:
-        return MPPIState(mean=jnp.broadcast_to(center, shape))
+        return MPPIState(mean=box.start(horizon))
 
     def step(
         objective_fn: ObjectiveFn, key: Array, state: MPPIState
     ) -> tuple[Solution, MPPIState]:
+        check_key("key", key)
+        check_record("state", state, MPPIState)
         check_array("state.mean", state.mean, shape)
 
         def iterate(mean: Array, keys: Array) -> tuple[Array, Array]:
             sample_key, value_key = keys
             noise = jax.random.normal(sample_key, (num_samples, *shape), jnp.float32)
-            actions = jnp.clip(mean + scale * noise, action_low, action_high)
+            actions = box.clip(mean + scale * noise)
             values = objective_fn(value_key, actions)
             check_array("objective_fn's result", values, [num_samples])
             # Ranks, not values, set the scale where one candidate has blown up.
             # The rejected neither set the scale nor have a weight, unless all are.
-            kept = not_rejected(values, WORST_VALUE)
+            kept = is_valid(values)
             quartiles = jnp.array([0.25, 0.75], jnp.float32)
             low, high = jnp.nanquantile(jnp.where(kept, values, jnp.nan), quartiles)
             spread = jnp.maximum(high - low, 1e-6)
@@ -88,11 +96,11 @@ def mppi(
                 (values - jnp.max(values)) / (temperature * spread), where=kept
             )
             mean = jnp.einsum("n,nha->ha", weights, actions)
-            return jnp.clip(mean, action_low, action_high), jnp.sum(weights * values)
+            return box.clip(mean), jnp.sum(weights * values)
 
         keys = jax.random.split(key, (num_iterations, 2))
         mean, values = jax.lax.scan(iterate, state.mean, keys)
-        shifted = jnp.concatenate([mean[1:], center[None]])
-        return Solution(actions=mean, value=values[-1]), MPPIState(mean=shifted)
+        solution = Solution(actions=mean, value=values[-1])
+        return solution, MPPIState(mean=box.shift(mean))
 
     return TrajectoryOptimizer(init, step)

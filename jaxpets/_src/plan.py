@@ -7,11 +7,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
-from jaxpets._src.checks import check_action_box, check_count, check_key
+from jaxpets._src.action_box import action_box
+from jaxpets._src.checks import (
+    check_callable,
+    check_count,
+    check_key,
+    check_record,
+)
 from jaxpets._src.chunks import chunked
+from jaxpets._src.elites import WORST_VALUE
 from jaxpets._src.types import (
-    WORST_VALUE,
     Planner,
     PlanOutput,
     PlanParams,
@@ -35,7 +42,9 @@ def plan(
     action and keeps the rest as the warm start. A candidate whose return is not
     finite is given the worst value, so that imagined divergence never wins.
 
-    Nothing is jitted. `step` is for one start state: map it over environments with
+    Nothing is jitted, and a plan that is not takes a thousand times as long: call
+    `jax.jit(planner.step)`, or step it inside a jitted scan. `step` is for one start
+    state: map it over environments with
     `jax.vmap(planner.step, (None, 0, 0, 0))`, over tasks with
     `(PlanParams(None, 0), 0, 0, 0)`, over seeds with `(PlanParams(0, 0), 0, 0, 0)`.
 
@@ -59,17 +68,25 @@ def plan(
       A Planner.
 
     Raises:
-      TypeError, ValueError: if chunk_size is no positive Python integer.
-      ValueError: from `step`, at trace time, when rollout_fn or reward_fn return a
-        shape that the contract does not allow, or chunks are asked of another kind of
-        key; when it is compiled, if the noise cannot be divided.
+      TypeError, ValueError: if an argument is not what it should be; from `step`, at
+        trace time, when params is no PlanParams, the state belongs to another search,
+        rollout_fn or reward_fn return a shape that the contract does not allow, or
+        chunks are asked of another kind of key; when it is compiled, if the noise
+        cannot be divided.
     """
+    check_callable("rollout_fn", rollout_fn)
+    check_callable("reward_fn", reward_fn)
+    check_record("optimizer", optimizer, TrajectoryOptimizer)
     if chunk_size is not None:
         check_count("chunk_size", chunk_size)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
-        reward = jnp.asarray(reward_fn(params, obs, action, next_obs))
         particles = obs.shape[:-1]
+        reward = reward_fn(params, obs, action, next_obs)
+        if not hasattr(reward, "dtype") and not isinstance(reward, (int, float)):
+            kind = type(reward).__name__
+            raise TypeError(f"reward_fn must return an array, got {kind}.")
+        reward = jnp.asarray(reward)
         if reward.dtype != jnp.float32:
             raise TypeError(f"reward_fn must return float32, got {reward.dtype}.")
         if reward.shape not in ((), particles):
@@ -84,6 +101,7 @@ def plan(
     def step(
         params: PlanParams, key: Array, state: Any, obs: Any
     ) -> tuple[PlanOutput, Any]:
+        check_record("params", params, PlanParams)
         check_key("key", key)
         imagine = _bound(rollout_fn, params.dynamics)
 
@@ -117,7 +135,7 @@ def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], 
     return bind(params) if bind else functools.partial(rollout_fn, params)
 
 
-def random_planner(action_low: Array, action_high: Array) -> Planner:
+def random_planner(action_low: ArrayLike, action_high: ArrayLike) -> Planner:
     """Builds a planner that draws every action uniformly from the box.
 
     The random arm of the paper, and the first trial of every other arm.
@@ -130,17 +148,17 @@ def random_planner(action_low: Array, action_high: Array) -> Planner:
       A Planner with an empty state; its plans have length one and value zero.
 
     Raises:
-      ValueError: if the box is not finite or empty.
+      TypeError, ValueError: if the box is not finite or empty.
     """
-    check_action_box(action_low, action_high)
+    box = action_box(action_low, action_high)
 
     def step(
         params: PlanParams, key: Array, state: tuple, obs: Any
     ) -> tuple[PlanOutput, tuple]:
         del params, obs
         check_key("key", key)
-        uniform = jax.random.uniform(key, action_low.shape, jnp.float32)
-        action = action_low + (action_high - action_low) * uniform
+        uniform = jax.random.uniform(key, box.low.shape, jnp.float32)
+        action = box.low + (box.high - box.low) * uniform
         return PlanOutput(action, action[None], jnp.zeros((), jnp.float32)), state
 
     return Planner(tuple, step)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.checks import check_array, check_count, check_key
 from jaxpets._src.moments import moments
 from jaxpets._src.types import Dataset
 
@@ -16,13 +16,21 @@ _MAX_BITS = 32
 
 
 class PseudoCounts(NamedTuple):
-    """The hash and every code seen so far."""
+    """The hash and every code seen so far.
 
-    projection: Array  # [k, D]
-    mean: Array  # [D]
-    std: Array  # [D]
-    codes: Array  # [C] uint32, sorted, padding among them
-    visits: Array  # [C] int32, how many states have the code
+    Attributes:
+      projection: `[k, D]`.
+      mean: `[D]`, of the states counted.
+      std: `[D]`, of the states counted.
+      codes: `[C]` uint32, sorted, padding among them.
+      visits: `[C]` int32, how many states have the code.
+    """
+
+    projection: Array
+    mean: Array
+    std: Array
+    codes: Array
+    visits: Array
 
 
 def simhash(key: Array, num_bits: int, obs_size: int) -> Array:
@@ -36,6 +44,7 @@ def simhash(key: Array, num_bits: int, obs_size: int) -> Array:
     Raises:
       TypeError, ValueError: unless `1 <= num_bits <= 32`.
     """
+    check_key("key", key)
     check_count("num_bits", num_bits)
     check_count("obs_size", obs_size)
     if num_bits > _MAX_BITS:
@@ -108,8 +117,8 @@ def pseudo_count(
       next_obs: `[E, P, D]`, or any leading shape.
 
     Returns:
-      `[E, P]`, the leading shape of next_obs; NaN where that is not finite: what blew
-      up was never seen, but is not new.
+      `[E, P]`, the leading shape of next_obs. It is NaN where next_obs is not finite: a
+      state that blew up has no code, and should not count as one never seen.
     """
     del obs, action
     novelty = jax.lax.rsqrt(1.0 + lookup(counts, next_obs).astype(jnp.float32))

@@ -22,7 +22,7 @@ def epistemic(
 
     Args:
       baseline_variance: `[D]`, w_base in units of obs squared; the paper takes the
-        ensemble's largest aleatoric variance, see `jaxpets.max_variance`.
+        ensemble's largest aleatoric variance, see `jaxpets.rewards.max_variance`.
       obs: `[E, P, D]`, unused.
       action: `[A]`, unused; exploration has no action cost.
       next_obs: `[E, P, D]`.

@@ -6,7 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.checks import (
+    check_array,
+    check_callable,
+    check_count,
+    check_key,
+)
 from jaxpets._src.types import DynamicsFn, RolloutFn
 
 
@@ -31,8 +36,11 @@ def particle_rollout(
       A RolloutFn whose start is an observation `[D]`.
 
     Raises:
-      ValueError: if num_particles is not a multiple of num_members.
+      TypeError, ValueError: if num_particles is not a multiple of num_members, or an
+        argument is not what it should be; from the rollout, when traced, if an array
+        does not fit.
     """
+    check_callable("dynamics_fn", dynamics_fn)
     check_count("num_members", num_members)
     check_count("num_particles", num_particles)
     if num_particles % num_members:
@@ -43,9 +51,12 @@ def particle_rollout(
     per_member = num_particles // num_members
 
     def rollout(params: Any, key: Array, obs: Array, actions: Array) -> Array:
+        check_key("key", key)
         check_array("obs", obs, ["D"])
         check_array("actions", actions, ["N", "H", "A"])
         num_samples, horizon, _ = actions.shape
+        check_count("the number of candidates in actions", num_samples)
+        check_count("the horizon of actions", horizon)
         rows = num_samples * per_member
         start = jnp.broadcast_to(obs, (num_members, rows, obs.shape[0]))
         row_actions = jnp.repeat(actions.swapaxes(0, 1), per_member, axis=1)

@@ -1,16 +1,6 @@
-"""The contracts of the library: shape letters, data records and Protocols.
+"""The contracts of the library: data records and Protocols.
 
-Shape letters, used by every docstring of jaxpets:
-
-  N  candidate action sequences (num_samples)
-  H  planning horizon
-  E  ensemble members
-  P  particles per member (num_particles = E * P)
-  B  rows of one member's batch; N * P inside a rollout
-  D  observation size
-  A  action size
-  T  environment steps
-  C  dataset capacity
+The letters of their shapes are explained in the docstring of `jaxpets`.
 """
 
 from collections.abc import Callable
@@ -18,54 +8,84 @@ from typing import Any, NamedTuple, Protocol
 
 from jax import Array
 
-# The value of a candidate whose return is not finite. Finite itself, so that means
-# over elites stay finite, and far below any return a task can give.
-WORST_VALUE = -1e30
-
 
 class Transition(NamedTuple):
-    """One step of an environment, or a batch of them with equal leading axes."""
+    """One step of an environment, or a batch of them with equal leading axes.
 
-    obs: Array  # [..., D]
-    action: Array  # [..., A]
-    next_obs: Array  # [..., D]
+    Attributes:
+      obs: `[..., D]`.
+      action: `[..., A]`.
+      next_obs: `[..., D]`.
+    """
+
+    obs: Array
+    action: Array
+    next_obs: Array
 
 
 class Dataset(NamedTuple):
-    """Transitions in arrays of fixed size; when full, the oldest rows are replaced."""
+    """Transitions in arrays of fixed size; when full, the oldest rows are replaced.
 
-    data: Transition  # [C, ...]; rows from `size` on hold zeros
-    size: Array  # [] int32, valid rows
-    cursor: Array  # [] int32, the next row to write
+    Attributes:
+      data: a Transition `[C, ...]`; rows from `size` on hold zeros.
+      size: `[]` int32, how many rows are valid.
+      cursor: `[]` int32, the next row to write.
+    """
+
+    data: Transition
+    size: Array
+    cursor: Array
 
 
 class PlanParams(NamedTuple):
-    """Everything about planning that may change between calls without a retrace."""
+    """Everything about planning that may change between calls without a retrace.
 
-    dynamics: Any  # forwarded to rollout_fn
-    reward: Any = ()  # forwarded to reward_fn
+    Attributes:
+      dynamics: the model's parameters, forwarded to rollout_fn; any pytree.
+      reward: the reward's data, forwarded to reward_fn; any pytree.
+    """
+
+    dynamics: Any
+    reward: Any = ()
 
 
 class Solution(NamedTuple):
-    """What a trajectory optimizer found."""
+    """What a trajectory optimizer found.
 
-    actions: Array  # [H, A]
-    value: Array  # [] mean value of the last elites
+    Attributes:
+      actions: `[H, A]`.
+      value: `[]`, the mean value of the last elites.
+    """
+
+    actions: Array
+    value: Array
 
 
 class PlanOutput(NamedTuple):
-    """What a planner decided."""
+    """What a planner decided.
 
-    action: Array  # [A] to execute now
-    actions: Array  # [H, A] the whole plan
-    value: Array  # [] return under the model, summed over the horizon, see Solution
+    Attributes:
+      action: `[A]`, to execute now.
+      actions: `[H, A]`, the whole plan.
+      value: `[]`, the return under the model, summed over the horizon: the mean over
+        the last elites, in the reward's unit.
+    """
+
+    action: Array
+    actions: Array
+    value: Array
 
 
 class EnvState(NamedTuple):
-    """State of an environment. It has no reward: phase 1 of the paper has none."""
+    """State of an environment. It has no reward: phase 1 of the paper has none.
 
-    obs: Array  # [D]
-    physics: Any  # whatever the simulator needs to go on
+    Attributes:
+      obs: `[D]` float32.
+      physics: whatever the simulator needs to go on; any pytree.
+    """
+
+    obs: Array
+    physics: Any
 
 
 class DynamicsFn(Protocol):
@@ -139,9 +159,10 @@ class ObjectiveFn(Protocol):
 class TrajectoryOptimizer(NamedTuple):
     """A search over action sequences; its state is the warm start.
 
-    init: `() -> state`.
-    step: `(objective_fn, key, state) -> (Solution, state)`; the state that comes out
-      is already shifted by one step.
+    Attributes:
+      init: `() -> state`.
+      step: `(objective_fn, key, state) -> (Solution, state)`; the state that comes out
+        is already shifted by one step.
     """
 
     init: Callable[[], Any]
@@ -151,8 +172,9 @@ class TrajectoryOptimizer(NamedTuple):
 class Planner(NamedTuple):
     """A policy that plans.
 
-    init: `() -> state`; call it at the start of every trial.
-    step: `(PlanParams, key, state, obs) -> (PlanOutput, state)`.
+    Attributes:
+      init: `() -> state`; call it at the start of every trial.
+      step: `(PlanParams, key, state, obs [D]) -> (PlanOutput, state)`.
     """
 
     init: Callable[[], Any]
@@ -162,9 +184,11 @@ class Planner(NamedTuple):
 class Env(NamedTuple):
     """A simulator of one environment; batch it with `jax.vmap`.
 
-    reset: `(key) -> EnvState`.
-    step: `(EnvState, action [A]) -> EnvState`.
-    action_low, action_high: `[A]`, finite.
+    Attributes:
+      reset: `(key) -> EnvState`.
+      step: `(EnvState, action [A]) -> EnvState`.
+      action_low: `[A]`, finite.
+      action_high: `[A]`, finite.
     """
 
     reset: Callable[[Array], EnvState]
@@ -176,15 +200,16 @@ class Env(NamedTuple):
 class ModelSpace(NamedTuple):
     """The coordinates in which a model sees observations.
 
-    The law `next_obs(o, target(o, x)) == x` must hold. A predicted variance is taken
-    to be the variance of the next observation, so `next_obs` should add the target
-    to something that it does not stretch.
+    The law `next_obs(o, target(o, x)) == x` must hold; `jaxpets.check_space` tries it
+    on data. A predicted variance is taken to be the variance of the next observation,
+    so `next_obs` should add the target to something that it does not stretch.
 
-    features: `(obs [..., D]) -> [..., F]`, what the network reads.
-    target: `(obs, next_obs) -> [..., D]`, what it predicts.
-    next_obs: `(obs, target) -> [..., D]`, the inverse of `target`.
-    bound: `(obs, low [D], high [D]) -> [..., D]`, keeps imagined observations in a
-      box. Leave free what grows without limit in the world, as an unwrapped angle.
+    Attributes:
+      features: `(obs [..., D]) -> [..., F]`, what the network reads.
+      target: `(obs, next_obs) -> [..., D]`, what it predicts.
+      next_obs: `(obs, target) -> [..., D]`, the inverse of `target`.
+      bound: `(obs, low [D], high [D]) -> [..., D]`, keeps imagined observations in a
+        box. Leave free what grows without limit in the world, as an unwrapped angle.
     """
 
     features: Callable[[Array], Array]

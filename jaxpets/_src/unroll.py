@@ -7,7 +7,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_count, check_key
+from jaxpets._src.checks import (
+    check_array,
+    check_count,
+    check_key,
+    check_like,
+    check_record,
+)
 from jaxpets._src.types import (
     Env,
     EnvState,
@@ -19,16 +25,41 @@ from jaxpets._src.types import (
 
 
 class UnrollState(NamedTuple):
-    """Where a trial stands; a trial may be unrolled in parts."""
+    """Where a trial stands; a trial may be unrolled in parts.
+
+    Attributes:
+      env: the environment's state.
+      planner: the planner's state.
+      step: `[]` int32, environment steps since the reset.
+    """
 
     env: EnvState
     planner: Any
-    step: Array  # [] int32, environment steps since the reset
+    step: Array
 
 
-def start(env: Env, planner: Planner, key: Array) -> UnrollState:
-    """Resets the environment and the planner for a new trial; the key is consumed."""
-    return UnrollState(env.reset(key), planner.init(), jnp.zeros((), jnp.int32))
+def start_trial(env: Env, planner: Planner, key: Array) -> UnrollState:
+    """Resets the environment and the planner for a new trial.
+
+    Args:
+      env: where to act.
+      planner: how to act.
+      key: consumed by the reset.
+
+    Returns:
+      The state from which `unroll` goes on.
+
+    Raises:
+      TypeError, ValueError: if an argument, or what `env.reset` returns, is not what
+        it should be.
+    """
+    check_record("env", env, Env)
+    check_record("planner", planner, Planner)
+    check_key("key", key)
+    state = env.reset(key)
+    check_record("env.reset's result", state, EnvState)
+    check_array("env.reset's result.obs", state.obs, ["D"])
+    return UnrollState(state, planner.init(), jnp.zeros((), jnp.int32))
 
 
 def unroll(
@@ -51,7 +82,7 @@ def unroll(
       planner: how to act.
       params: forwarded to the planner.
       key: consumed by the whole trial.
-      state: from `start`, or from the last part.
+      state: from `start_trial`, or from the last part.
       length: T.
       observe_fn: what the planner gets to see; `lambda state: state` for a planner
         that imagines with the simulator, see `jaxpets.envs.env_rollout`.
@@ -60,10 +91,13 @@ def unroll(
       The state after T steps, the transitions `[T, ...]` and the plans `[T, ...]`.
 
     Raises:
-      TypeError, ValueError: unless length is a positive Python integer and key a key.
+      TypeError, ValueError: if an argument is not what it should be, or env.step
+        returns another structure, shape or dtype than it takes.
     """
-    check_count("length", length)
+    check_record("params", params, PlanParams)
     check_key("key", key)
+    check_record("state", state, UnrollState)
+    check_count("length", length)
 
     def tick(state: UnrollState, _: None) -> tuple[UnrollState, tuple]:
         plan_key = jax.random.fold_in(key, state.step)
@@ -71,6 +105,7 @@ def unroll(
             params, plan_key, state.planner, observe_fn(state.env)
         )
         env_state = env.step(state.env, output.action)
+        check_like("env.step's result", env_state, state.env)
         transition = Transition(state.env.obs, output.action, env_state.obs)
         return UnrollState(env_state, planner_state, state.step + 1), (
             transition,

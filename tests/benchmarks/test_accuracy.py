@@ -108,7 +108,7 @@ def test_values_are_those_that_a_planner_sees(performed):
     path, values = accuracy.imagine(params, size, "f32")(keys[1], obs, actions)
     assert path.shape == (10, 4, 5, 1, half_cheetah.OBS_SIZE)
     seen = {
-        "epistemic": (jaxpets.rewards.epistemic, jaxpets.max_variance(params)),
+        "epistemic": (jaxpets.rewards.epistemic, jaxpets.rewards.max_variance(params)),
         "forward": (half_cheetah.task_reward, half_cheetah.task("forward")),
         "back-flip": (half_cheetah.task_reward, half_cheetah.task("back-flip")),
     }

@@ -19,7 +19,7 @@ from jax.sharding import PartitionSpec as P
 import jaxpets
 from benchmarks import scale
 from experiments import acting, cli
-from experiments.build import EXPLORE, LEARNER_AXES, build, trial_keys
+from experiments.build import EXPLORE, build, trial_keys
 from experiments.parallel import devices
 from experiments.run import main
 
@@ -43,7 +43,7 @@ def acting_program(flags):
         parts.env, parts.explorer, config.planner.horizon, config.chunk_length, spread
     )
     keys = devices.place(spread, trial_keys(config, EXPLORE, 2), devices.SEED)
-    init = jax.vmap(parts.learner.init, out_axes=LEARNER_AXES)
+    init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
     state = devices.place(spread, jax.jit(init)(keys), devices.SEED)
     params = jaxpets.PlanParams(state.params, state.reward)
     begin = actors.start(keys)
@@ -63,11 +63,11 @@ def one_plan():
         return -((next_obs[..., 0] - target) ** 2)
 
     force, obs = jnp.ones(1), jnp.zeros(2)
-    search = jaxpets.cem(
+    search = jaxpets.optimizers.cem(
         horizon=5, action_low=-force, action_high=force, num_samples=64, num_elites=8
     )
     rollout = jaxpets.particle_rollout(cart, num_particles=4)
-    planner = jaxpets.plan(rollout, reach, jaxpets.sharded(search, "device"))
+    planner = jaxpets.plan(rollout, reach, jaxpets.optimizers.sharded(search, "device"))
     inputs = jaxpets.PlanParams(0.1, 1.0), jax.random.key(0), planner.init(), obs
     mesh = Mesh(np.array(jax.devices()), "device")
     step = jax.jit(

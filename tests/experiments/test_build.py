@@ -51,12 +51,12 @@ def test_a_search_is_unrolled_beside_a_kernel_of_a_gpu_only(
         searches.append(unroll)
         return search(**size)
 
-    search, scan = jaxpets.cem, jaxpets.particle_rollout
+    search, scan = jaxpets.optimizers.cem, jaxpets.particle_rollout
     kernel = scan(lambda *_: None, num_members=3, num_particles=3)
     kernel = kernel if fallback else Kernel()
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(jaxpets, "fused_rollout", lambda *_, **__: kernel)
-    monkeypatch.setattr(jaxpets, "cem", cem)
+    monkeypatch.setattr(jaxpets.optimizers, "cem", cem)
     precision, fused = flags
     phase = ["--phase", "explore", "--preset", "smoke", "--allow-cpu"]
     build(cli.parse([*phase, "--planner.precision", precision, fused]))

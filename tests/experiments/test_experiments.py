@@ -25,7 +25,7 @@ SMOKE = ("--phase", "explore", "--preset", "smoke", "--engine", "mujoco")
 NAME = "smoke-epistemic"
 TRIAL, STEPS = 3, 20
 FIT = {
-    "loss", "mse", "num_updates", "num_skipped", "max_logvar_low", "max_logvar_high",
+    "nll", "mse", "num_updates", "num_skipped", "max_logvar_low", "max_logvar_high",
     "min_logvar_low", "min_logvar_high",
 }  # fmt: skip
 

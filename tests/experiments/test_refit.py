@@ -48,7 +48,7 @@ def model(folder, config):
 def test_the_model_that_performs_is_refit_on_all_data(explored, performed):
     config = cli.parse(["--phase", "zero-shot", "--from", str(explored), *FLAGS])
     state = runs.learner(explored)
-    fitter = jaxpets.fit(
+    fitter = jaxpets.fitter(
         jaxpets.ensemble(
             jaxpets.EnsembleConfig(
                 num_members=3,

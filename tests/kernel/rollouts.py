@@ -61,7 +61,6 @@ class Case:
         return jaxpets.EnsembleConfig(
             num_members=self.num_members,
             hidden_sizes=self.hidden_sizes,
-            weight_decays=(1e-4,) * (len(self.hidden_sizes) + 1),
             precision=precision,
             state_margin=self.state_margin,
         )

@@ -98,7 +98,7 @@ def counts(i):
     projection = jaxpets.rewards.simhash(jax.random.key(5), 8, 2)
     rows = particles(i).reshape(12, 2)
     data = jaxpets.Transition(rows, rows[:, :1], rows)
-    dataset = jaxpets.append(jaxpets.init_dataset(16, 2, 1), data)
+    dataset = jaxpets.datasets.append(jaxpets.datasets.init(16, 2, 1), data)
     return jaxpets.rewards.count_states(projection, dataset)
 
 

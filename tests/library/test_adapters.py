@@ -59,7 +59,7 @@ def test_from_brax_runs_in_our_planner(pendulum, key):
         del params, obs
         return -(next_obs[..., 1] ** 2) - 0.01 * next_obs[..., 0] ** 2
 
-    search = jaxpets.cem(
+    search = jaxpets.optimizers.cem(
         horizon=8,
         action_low=env.action_low,
         action_high=env.action_high,

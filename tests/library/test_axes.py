@@ -79,7 +79,7 @@ def test_one_trace_over_many_model_updates():
     step(PlanParams(model(0), jnp.ones(2)), key_of(0), state, cart_obs(0))
     first = len(traces)
     for i in range(1, 3):
-        params = PlanParams(model(i), jaxpets.max_variance(model(i)))
+        params = PlanParams(model(i), jaxpets.rewards.max_variance(model(i)))
         _, state = step(params, key_of(i), state, cart_obs(i))
     assert len(traces) == first and step._cache_size() == 1
 
@@ -89,7 +89,7 @@ def test_unroll_obeys_the_key_checker():
     params = PlanParams(jnp.float32(1.0), jnp.float32(0.5))
 
     def trial(reset_key, act_key):
-        begin = jaxpets.start(ENV, planner, reset_key)
+        begin = jaxpets.start_trial(ENV, planner, reset_key)
         return jaxpets.unroll(ENV, planner, params, act_key, begin, length=3)
 
     with jax.debug_key_reuse(True):

@@ -23,7 +23,7 @@ def search(**changes):
         num_elites=6,
         num_iterations=4,
     )
-    return jaxpets.cem(**(settings | changes))
+    return jaxpets.optimizers.cem(**(settings | changes))
 
 
 def quadratic(optimum):
@@ -110,7 +110,7 @@ def test_samples_of_an_iteration_use_fresh_noise():
 
 def test_search_starts_from_the_state():
     mean = jnp.full((4, 2), 0.9)
-    samples = record(search(), bumpy, jaxpets.CEMState(mean)).actions[0]
+    samples = record(search(), bumpy, jaxpets.optimizers.CEMState(mean)).actions[0]
     # The margin to the bound is 0.1, so two deviations reach from 0.8 to 1.
     assert samples.min() >= 0.8 - 1e-6
     np.testing.assert_allclose(samples.mean(0), mean, atol=0.03)
@@ -151,7 +151,7 @@ BOXED = search(action_low=LOW, action_high=HIGH, num_samples=500, num_elites=50)
 def test_samples_never_leave_the_box(start):
     mean = jnp.broadcast_to(jnp.where(start > 0, HIGH, LOW), (4, 2))
     # Rewards pull outwards, and one search starts on the bound itself.
-    for state in (BOXED.init(), jaxpets.CEMState(mean)):
+    for state in (BOXED.init(), jaxpets.optimizers.CEMState(mean)):
         found = record(BOXED, pull, state, args=(jnp.float32(start),))
         for samples in [*found.actions, np.asarray(found.solution.actions)[None]]:
             assert np.all(samples >= np.asarray(LOW))
@@ -179,7 +179,9 @@ def test_rejected_candidates_are_no_elites():
 
     def value(actions):
         bad = actions[:, 0, 0] > -0.4
-        return jnp.where(bad, jaxpets.WORST_VALUE, -jnp.abs(actions[:, 0, 0] + 0.7))
+        return jnp.where(
+            bad, jaxpets.optimizers.WORST_VALUE, -jnp.abs(actions[:, 0, 0] + 0.7)
+        )
 
     found = record(search(num_samples=200, num_iterations=1), value)
     solution = found.solution
@@ -204,7 +206,7 @@ def test_few_left_of_many_rejected_make_the_plan():
     """Fewer than num_elites are left: the plan is their mean, not that of the rest."""
 
     def value(actions):
-        return jnp.where(actions[:, 0, 0] < 0.75, jaxpets.WORST_VALUE, 1.0)
+        return jnp.where(actions[:, 0, 0] < 0.75, jaxpets.optimizers.WORST_VALUE, 1.0)
 
     found = record(search(num_samples=60, num_iterations=1, momentum=0.0), value)
     assert 0 < (found.values[0] > 0).sum() < 6
@@ -222,8 +224,7 @@ def test_few_left_of_many_rejected_make_the_plan():
         (dict(momentum=1.5), r"momentum must be in \[0, 1\], got 1.5"),
         (dict(min_variance=-1.0), "min_variance must be finite and .* got -1.0"),
         (dict(action_low=ONE), "action_low and action_high .* low < high"),
-        (dict(action_high=jnp.ones(3)), r"action_high must be float32\[2\]"),
-        (dict(action_low=-jnp.ones(2, jnp.int32)), "action_low must be float32.*int32"),
+        (dict(action_high=jnp.ones(3)), r"action_high must be \[2\] as"),
     ],
 )
 def test_bad_settings_fail_when_built(changes, text):

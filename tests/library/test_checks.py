@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxpets._src import checks
+from jaxpets._src.action_box import action_box
 
 
 @pytest.mark.parametrize("value", [1, 7, np.int32(3)])
@@ -114,12 +115,26 @@ BAD_BOXES = {
 def test_action_box_refuses_what_cannot_be_searched(name):
     low, high = (jnp.asarray(bound, jnp.float32) for bound in BAD_BOXES[name])
     with pytest.raises(ValueError, match=r"action_(low|high)"):
-        checks.check_action_box(low, high)
+        action_box(low, high)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int32])
+def test_an_action_box_is_float32_whatever_its_bounds_are(dtype):
+    box = action_box(-np.ones(2, dtype), np.full(2, 3, dtype))
+    assert all(part.dtype == jnp.float32 for part in box)
+    np.testing.assert_array_equal(box.center, [1.0, 1.0])
+    np.testing.assert_array_equal(box.half_width, [2.0, 2.0])
+
+
+@pytest.mark.parametrize("bound", [None, "box", [-1.0], np.array(["a"])])
+def test_an_action_box_is_of_numbers(bound):
+    with pytest.raises(TypeError, match=r"action_low must be numbers \[A\], got"):
+        action_box(bound, np.ones(1))
 
 
 def test_action_box_looks_at_no_traced_value():
     def build(low):
-        checks.check_action_box(low, -low)
+        action_box(low, -low)
         return low
 
     jax.jit(build)(jnp.ones(2))  # crossed, but that is not known while tracing

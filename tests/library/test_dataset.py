@@ -28,7 +28,7 @@ def held(dataset):
 
 
 def test_starts_empty():
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     assert dataset.size == 0 and dataset.size.dtype == jnp.int32
     assert dataset.data.obs.shape == (CAPACITY, 2)
     assert dataset.data.action.shape == (CAPACITY, 1)
@@ -39,11 +39,11 @@ def test_starts_empty():
 )
 def test_keeps_the_newest_rows(lengths):
     """At capacity, one past it, and round and round, as a bounded queue."""
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     queue = collections.deque(maxlen=CAPACITY)
     first = 0
     for length in lengths:
-        dataset = jaxpets.append(dataset, numbered(first, length))
+        dataset = jaxpets.datasets.append(dataset, numbered(first, length))
         queue.extend(range(first, first + length))
         first += length
         assert int(dataset.size) == len(queue)
@@ -51,8 +51,8 @@ def test_keeps_the_newest_rows(lengths):
 
 
 def test_one_trace_while_it_grows():
-    append = jax.jit(jaxpets.append)
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    append = jax.jit(jaxpets.datasets.append)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     want = toys.avals(dataset)
     for first in range(0, 20, 4):
         dataset = append(dataset, numbered(first, 4))
@@ -61,26 +61,28 @@ def test_one_trace_while_it_grows():
 
 
 def test_eager_append_keeps_the_avals():
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
-    assert toys.avals(jaxpets.append(dataset, numbered(0, 3))) == toys.avals(dataset)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
+    assert toys.avals(jaxpets.datasets.append(dataset, numbered(0, 3))) == toys.avals(
+        dataset
+    )
 
 
 @pytest.mark.parametrize("count", [0, 5, 8, 11])
 def test_growing_keeps_every_row_and_the_oldest_goes_first(count):
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     for first in range(count):
-        dataset = jaxpets.append(dataset, numbered(first, 1))
-    grown = jaxpets.grow(dataset, 12)
+        dataset = jaxpets.datasets.append(dataset, numbered(first, 1))
+    grown = jaxpets.datasets.grow(dataset, 12)
     assert grown.data.obs.shape == (12, 2) and grown.size == dataset.size
     rows = list(range(max(0, count - CAPACITY), count))
     np.testing.assert_array_equal(grown.data.obs[: len(rows), 0], rows)
     assert held(grown) == rows
     # It is a ring of the new capacity: filled to one past it, the oldest row is lost.
     room = 12 - len(rows)
-    full = jaxpets.append(grown, numbered(count, room))
+    full = jaxpets.datasets.append(grown, numbered(count, room))
     rows += range(count, count + room)
     assert held(full) == rows
-    assert held(jaxpets.append(full, numbered(count + room, 1))) == [
+    assert held(jaxpets.datasets.append(full, numbered(count + room, 1))) == [
         *rows[1:],
         count + room,
     ]
@@ -89,19 +91,21 @@ def test_growing_keeps_every_row_and_the_oldest_goes_first(count):
 
 
 def test_growing_to_the_same_capacity_keeps_the_rows():
-    dataset = jaxpets.append(jaxpets.init_dataset(CAPACITY, 2, 1), numbered(0, 8))
-    toys.assert_trees_close(jaxpets.grow(dataset, CAPACITY), dataset, rtol=0)
+    dataset = jaxpets.datasets.append(
+        jaxpets.datasets.init(CAPACITY, 2, 1), numbered(0, 8)
+    )
+    toys.assert_trees_close(jaxpets.datasets.grow(dataset, CAPACITY), dataset, rtol=0)
 
 
 def test_a_dataset_does_not_shrink():
     with pytest.raises(ValueError, match="capacity must be at least 8, got 7"):
-        jaxpets.grow(jaxpets.init_dataset(CAPACITY, 2, 1), 7)
+        jaxpets.datasets.grow(jaxpets.datasets.init(CAPACITY, 2, 1), 7)
 
 
 def test_too_many_rows_fail():
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     with pytest.raises(ValueError, match="capacity of 8, got 9 rows"):
-        jaxpets.append(dataset, numbered(0, 9))
+        jaxpets.datasets.append(dataset, numbered(0, 9))
 
 
 @pytest.mark.parametrize(
@@ -117,26 +121,30 @@ def test_too_many_rows_fail():
 def test_rows_that_do_not_fit_fail(name, value, wanted):
     rows = numbered(0, 3)._replace(**{name: value})
     with pytest.raises(ValueError, match=rf"transitions\.{name} must be {wanted}"):
-        jaxpets.append(jaxpets.init_dataset(CAPACITY, 2, 1), rows)
+        jaxpets.datasets.append(jaxpets.datasets.init(CAPACITY, 2, 1), rows)
 
 
 @pytest.mark.parametrize("sizes", [(0, 2, 1), (8, 0, 1), (8, 2, 0)])
 def test_sizes_are_positive(sizes):
     with pytest.raises(ValueError, match="must be at least 1, got 0"):
-        jaxpets.init_dataset(*sizes)
+        jaxpets.datasets.init(*sizes)
 
 
 def test_sizes_are_integers():
     with pytest.raises(TypeError, match="capacity must be a Python int"):
-        jaxpets.init_dataset(1e4, 2, 1)
+        jaxpets.datasets.init(1e4, 2, 1)
 
 
 def test_the_variance_is_that_of_the_rows_that_are_there():
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
-    np.testing.assert_array_equal(jaxpets.obs_variance(dataset), [1.0, 1.0])
-    dataset = jaxpets.append(dataset, numbered(3, 5))
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
+    np.testing.assert_array_equal(jaxpets.datasets.obs_variance(dataset), [1.0, 1.0])
+    dataset = jaxpets.datasets.append(dataset, numbered(3, 5))
     want = np.arange(3.0, 8.0).var()
-    np.testing.assert_allclose(jaxpets.obs_variance(dataset), [want, want], rtol=1e-6)
-    dataset = jaxpets.append(dataset, numbered(8, 7))  # the oldest go
+    np.testing.assert_allclose(
+        jaxpets.datasets.obs_variance(dataset), [want, want], rtol=1e-6
+    )
+    dataset = jaxpets.datasets.append(dataset, numbered(8, 7))  # the oldest go
     want = np.arange(7.0, 15.0).var()
-    np.testing.assert_allclose(jaxpets.obs_variance(dataset), [want, want], rtol=1e-6)
+    np.testing.assert_allclose(
+        jaxpets.datasets.obs_variance(dataset), [want, want], rtol=1e-6
+    )

@@ -9,6 +9,7 @@ import toys
 
 import jaxpets
 from jaxpets import EnsembleConfig, Precision
+from jaxpets._src.ensemble_config import layer_decays
 
 E, B, D, A = 3, 7, 2, 1
 
@@ -164,7 +165,9 @@ def test_starts_as_pets_does():
     np.testing.assert_array_equal(network.max_logvar, np.full(18, 0.5))
     np.testing.assert_array_equal(network.min_logvar, np.full(18, -10.0))
     assert sum(x.size for x in jax.tree.leaves(network)) == 664_180 + 36
-    np.testing.assert_allclose(jaxpets.max_variance(params), np.exp(0.5), rtol=1e-6)
+    np.testing.assert_allclose(
+        jaxpets.rewards.max_variance(params), np.exp(0.5), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("precision", [Precision.TF32, Precision.BF16])
@@ -211,7 +214,7 @@ def test_scaler_equals_the_reference_on_the_rows_in_use(model):
 
 
 def test_scaler_of_nothing_is_the_identity(model):
-    empty = jaxpets.init_dataset(8, D, A)
+    empty = jaxpets.datasets.init(8, D, A)
     scaler = model.fit_scaler(empty.data, empty.size)
     untrained = jax.jit(model.init)(jax.random.key(0))
     toys.assert_trees_close(scaler, untrained.scaler, rtol=0)
@@ -245,11 +248,11 @@ def test_delta_space_obeys_its_law():
         (dict(num_members=5.0), TypeError, "num_members must be a Python int"),
         (dict(hidden_sizes=(200, 0, 1, 1)), ValueError, "hidden_sizes must be at leas"),
         (dict(hidden_sizes=200), TypeError, "hidden_sizes must be .*200"),
-        (dict(hidden_sizes=(200,)), ValueError, r"weight_decays must have .*\(2\).* 5"),
+        (dict(weight_decays=(1.0,)), ValueError, r"weight_decays must be .*\(5\).* 1"),
         (
-            dict(weight_decays=1e-4),
+            dict(weight_decays="much"),
             TypeError,
-            "weight_decays must be a tuple",
+            "weight_decays must be a Python float",
         ),
         (
             dict(weight_decays=(1.0, 1.0, 1.0, 1.0, -1.0)),
@@ -282,3 +285,18 @@ def test_wrong_arguments_fail_when_traced(model, params):
         model.predict(params, obs[:2], action)
     with pytest.raises(ValueError, match=r"action must be float32\[7, 1\], got"):
         model.sample(params, jax.random.key(0), obs, action[:5])
+
+
+@pytest.mark.parametrize(
+    ("hidden_sizes", "decays", "wanted"),
+    [
+        ((8,) * 4, None, (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4)),  # PETS on HalfCheetah
+        ((8,) * 2, None, (2.5e-5, 5e-5, 1e-4)),
+        ((8,) * 2, 0.5, (0.5, 0.5, 0.5)),
+        ((8,) * 2, (1.0, 2.0, 3.0), (1.0, 2.0, 3.0)),
+        ((), None, (1e-4,)),
+    ],
+)
+def test_weight_decays_fit_any_number_of_layers(hidden_sizes, decays, wanted):
+    config = EnsembleConfig(hidden_sizes=hidden_sizes, weight_decays=decays)
+    assert layer_decays(config) == wanted

@@ -20,7 +20,7 @@ def search(**changes):
         num_iterations=3,
         kept_fraction=0.5,
     )
-    return jaxpets.icem(**(settings | changes))
+    return jaxpets.optimizers.icem(**(settings | changes))
 
 
 SEARCH = search()
@@ -38,7 +38,7 @@ def rows(sequences):
 @pytest.mark.parametrize("execute_best", [True, False])
 def test_few_left_of_many_rejected_make_the_plan(execute_best):
     def value(actions):
-        return jnp.where(actions[:, 0, 0] < 0.9, jaxpets.WORST_VALUE, 1.0)
+        return jnp.where(actions[:, 0, 0] < 0.9, jaxpets.optimizers.WORST_VALUE, 1.0)
 
     optimizer = search(num_iterations=1, momentum=0.0, execute_best=execute_best)
     found = record(optimizer, value)

@@ -10,13 +10,13 @@ from jaxpets import FitConfig, RewardData
 
 ENV = toys.cart_env()
 MODEL = toys.small_ensemble()
-FITTER = jaxpets.fit(MODEL, optax.adam(3e-3), FitConfig(num_epochs=10, batch_size=8))
+FITTER = jaxpets.fitter(MODEL, optax.adam(3e-3), FitConfig(num_epochs=10, batch_size=8))
 ROLLOUT = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
 EXPLORER = jaxpets.plan(ROLLOUT, jaxpets.rewards.epistemic, toys.optimizer("cem"))
 CHANCE = jaxpets.random_planner(ENV.action_low, ENV.action_high)
 BASELINE = RewardData(
     init=lambda key: jnp.zeros(2),
-    refresh=lambda data, params, dataset: jaxpets.max_variance(params),
+    refresh=lambda data, params, dataset: jaxpets.rewards.max_variance(params),
 )
 LENGTH = 20
 
@@ -64,7 +64,9 @@ def test_a_trial_acts_learns_and_refreshes(key):
         after.dataset.data.obs[:LENGTH], output.transitions.obs
     )
     assert output.fit.num_updates == 10 * 3
-    np.testing.assert_array_equal(after.reward, jaxpets.max_variance(after.params))
+    np.testing.assert_array_equal(
+        after.reward, jaxpets.rewards.max_variance(after.params)
+    )
     assert jnp.any(after.reward != state.reward)
 
 
@@ -117,7 +119,7 @@ def test_one_trace_and_stable_avals_while_data_grow(key):
 
 def test_vmapped_seeds_equal_single_runs():
     """As the experiments map it: the seeds share the size of their datasets."""
-    axes = jaxpets.LearnerState(0, 0, jaxpets.DATASET_AXES, 0)
+    axes = jaxpets.LearnerState(0, 0, jaxpets.datasets.AXES, 0)
     keys = jax.random.split(jax.random.key(3), 2)
     states = jax.jit(jax.vmap(LEARNER.init, out_axes=axes))(keys)
     step = jax.vmap(
@@ -140,7 +142,7 @@ def test_learning_alone_equals_its_half_of_a_trial(key):
     state = INIT(key)
     transitions = toys.transitions(LENGTH)
     after, metrics = jax.jit(LEARNER.learn)(key, state, transitions)
-    dataset = jaxpets.append(state.dataset, transitions)
+    dataset = jaxpets.datasets.append(state.dataset, transitions)
     want = jax.jit(FITTER.step)(state.params, key, state.fit, dataset)
     toys.assert_trees_close((after.params, after.fit, metrics), want, rtol=0)
     toys.assert_trees_close(after.dataset, dataset, rtol=0)
@@ -149,7 +151,7 @@ def test_learning_alone_equals_its_half_of_a_trial(key):
 def test_counts_are_rebuilt_once_per_trial(key):
     counter = RewardData(
         init=lambda key: jaxpets.rewards.count_states(
-            jaxpets.rewards.simhash(key, 16, 2), jaxpets.init_dataset(3 * LENGTH, 2, 1)
+            jaxpets.rewards.simhash(key, 16, 2), jaxpets.datasets.init(3 * LENGTH, 2, 1)
         ),
         refresh=lambda counts, params, dataset: jaxpets.rewards.count_states(
             counts.projection, dataset
@@ -181,7 +183,7 @@ def test_bad_settings_fail_when_built(key):
 def test_a_model_of_another_size_fails(key):
     """An ensemble for three observations cannot learn an environment with two."""
     model = toys.small_ensemble(obs_size=3)
-    fitter = jaxpets.fit(model, optax.adam(1e-3), FitConfig())
+    fitter = jaxpets.fitter(model, optax.adam(1e-3), FitConfig())
 
     def build_and_learn():
         learner = jaxpets.learner(

@@ -11,7 +11,7 @@ ONE = jnp.ones(2)
 
 def search(**changes):
     settings = dict(horizon=4, action_low=-ONE, action_high=ONE, num_samples=60)
-    return jaxpets.mppi(**(settings | changes))
+    return jaxpets.optimizers.mppi(**(settings | changes))
 
 
 SEARCH = search()
@@ -69,7 +69,9 @@ def test_cold_follows_the_best_and_hot_averages():
 
 
 def censored(actions, limit):
-    return jnp.where(actions[:, 0, 0] > limit, jaxpets.WORST_VALUE, bumpy(actions))
+    return jnp.where(
+        actions[:, 0, 0] > limit, jaxpets.optimizers.WORST_VALUE, bumpy(actions)
+    )
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.95])

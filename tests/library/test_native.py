@@ -207,7 +207,7 @@ def test_jitted_scan_equals_the_loop(env, states, actions):
 
 def test_plans_with_and_in_the_simulator(env, states, key):
     """`unroll` with a planner that imagines with the environment it acts in."""
-    search = jaxpets.cem(
+    search = jaxpets.optimizers.cem(
         horizon=2,
         action_low=env.action_low,
         action_high=env.action_high,
@@ -220,7 +220,7 @@ def test_plans_with_and_in_the_simulator(env, states, key):
 
     def act(key):
         start_key, key = jax.random.split(key)
-        begin = jaxpets.start(env, planner, start_key)
+        begin = jaxpets.start_trial(env, planner, start_key)
         run = jaxpets.unroll(
             env, planner, params, key, begin, length=4, observe_fn=lambda s: s
         )

@@ -87,7 +87,7 @@ def test_one_bad_particle_makes_the_worst_candidate(bad):
     actions = jnp.zeros((3, 4, 1)).at[1, 2].set(0.9)
     params = PARAMS._replace(reward=jnp.float32(bad))
     values = values_of(ROLLOUT, reward, params, actions)
-    assert values[1] == jnp.float32(jaxpets.WORST_VALUE)
+    assert values[1] == jnp.float32(jaxpets.optimizers.WORST_VALUE)
     assert jnp.all(values[jnp.array([0, 2])] > -100)
 
 
@@ -101,7 +101,7 @@ def test_a_model_that_diverges_makes_the_worst_candidate(bad):
     rollout = jaxpets.particle_rollout(dynamics)
     params = PlanParams(jnp.float32(bad))
     values = values_of(rollout, lambda p, o, a, n: n[..., 0], params, actions)
-    assert values[1] == jnp.float32(jaxpets.WORST_VALUE)
+    assert values[1] == jnp.float32(jaxpets.optimizers.WORST_VALUE)
 
 
 @pytest.mark.parametrize("bad", BAD)

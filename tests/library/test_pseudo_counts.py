@@ -19,8 +19,8 @@ def dataset_of(states, capacity=CAPACITY):
     """A dataset whose next_obs are `states`; the rest is another thing."""
     states = jnp.asarray(states, jnp.float32)
     rows = jaxpets.Transition(states + 7.0, jnp.zeros((len(states), 1)), states)
-    empty = jaxpets.init_dataset(capacity, states.shape[1], 1)
-    return jaxpets.append(empty, rows)
+    empty = jaxpets.datasets.init(capacity, states.shape[1], 1)
+    return jaxpets.datasets.append(empty, rows)
 
 
 def clustered(seed=0, size=SIZE):
@@ -111,7 +111,7 @@ def test_bonus_falls_with_the_root_of_visits():
 
 def test_unseen_states_have_the_full_bonus():
     projection = simhash(jax.random.key(0), 32, D)
-    empty = count_states(projection, jaxpets.init_dataset(CAPACITY, D, 1))
+    empty = count_states(projection, jaxpets.datasets.init(CAPACITY, D, 1))
     obs = jnp.asarray(clustered()[:20].reshape(4, 5, D))
     np.testing.assert_array_equal(lookup(empty, obs), np.zeros((4, 5)))
     np.testing.assert_array_equal(pseudo_count(empty, obs, None, obs), 1.0)
@@ -133,10 +133,10 @@ def test_old_states_are_hashed_anew():
 
 def test_counts_follow_a_ring_that_went_round():
     states = clustered(size=300)
-    dataset = jaxpets.init_dataset(200, D, 1)
+    dataset = jaxpets.datasets.init(200, D, 1)
     for part in jnp.asarray(states).reshape(2, 150, D):
         rows = jaxpets.Transition(part, jnp.zeros((150, 1)), part)
-        dataset = jaxpets.append(dataset, rows)
+        dataset = jaxpets.datasets.append(dataset, rows)
     projection = np.asarray(simhash(jax.random.key(2), 32, D))
     want = reference.DictCounts(projection, states[-200:])
     assert margin(want, states) > 1e-5

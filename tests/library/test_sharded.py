@@ -36,7 +36,7 @@ def test_values_are_those_of_the_parts():
     actions = jnp.sin(jnp.arange(8.0 * HORIZON)).reshape(8, HORIZON, 1)
     obs = cart_obs(1)
     planner = jaxpets.plan(
-        NOISY, toys.reach, jaxpets.sharded(toys.probe(actions), "device")
+        NOISY, toys.reach, jaxpets.optimizers.sharded(toys.probe(actions), "device")
     )
     _, values = over_axis(planner, obs)
     for i in range(SIZE):
@@ -53,7 +53,8 @@ def test_without_noise_it_is_the_same_plan(name):
     search = toys.optimizer(name, HORIZON)
     obs = cart_obs(2)
     got = over_axis(
-        jaxpets.plan(EXACT, toys.reach, jaxpets.sharded(search, "device")), obs
+        jaxpets.plan(EXACT, toys.reach, jaxpets.optimizers.sharded(search, "device")),
+        obs,
     )
     alone = jaxpets.plan(EXACT, toys.reach, search)
     want = jax.jit(alone.step)(PARAMS, key_of(0), alone.init(), obs)
@@ -61,14 +62,14 @@ def test_without_noise_it_is_the_same_plan(name):
 
 
 def test_the_size_of_the_axis_changes_the_noise_only():
-    search = jaxpets.sharded(toys.optimizer("cem", HORIZON), "device")
+    search = jaxpets.optimizers.sharded(toys.optimizer("cem", HORIZON), "device")
     got = over_axis(jaxpets.plan(EXACT, toys.reach, search), cart_obs(0), size=1)
     want = over_axis(jaxpets.plan(EXACT, toys.reach, search), cart_obs(0), size=4)
     toys.assert_trees_close(got, want, **CLOSE)
 
 
 def test_no_key_is_used_twice():
-    search = jaxpets.sharded(toys.optimizer("cem", HORIZON), "device")
+    search = jaxpets.optimizers.sharded(toys.optimizer("cem", HORIZON), "device")
     planner = jaxpets.plan(NOISY, toys.reach, search)
     mesh = jax.sharding.Mesh(jax.devices()[:1], "device")
     spec = jax.sharding.PartitionSpec()
@@ -81,7 +82,7 @@ def test_no_key_is_used_twice():
 
 
 def test_candidates_must_divide():
-    search = jaxpets.sharded(toys.optimizer("cem", HORIZON), "device")
+    search = jaxpets.optimizers.sharded(toys.optimizer("cem", HORIZON), "device")
     planner = jaxpets.plan(NOISY, toys.reach, search)
     words = r"num_samples must be a multiple of .* axis 'device' \(5\), got 64\."
     with pytest.raises(ValueError, match=words):
@@ -90,7 +91,9 @@ def test_candidates_must_divide():
 
 def test_the_axis_must_be_there():
     planner = jaxpets.plan(
-        NOISY, toys.reach, jaxpets.sharded(toys.optimizer("cem", HORIZON), "device")
+        NOISY,
+        toys.reach,
+        jaxpets.optimizers.sharded(toys.optimizer("cem", HORIZON), "device"),
     )
     with pytest.raises(NameError, match="device"):
         planner.step(PARAMS, key_of(0), planner.init(), cart_obs(0))

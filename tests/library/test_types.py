@@ -7,7 +7,7 @@ import jaxpets
 
 def test_worst_value_stays_finite_in_sums_and_below_any_return():
     # As many elites as anyone would take, summed in float32.
-    worst = jnp.full((100_000,), jaxpets.WORST_VALUE, jnp.float32)
+    worst = jnp.full((100_000,), jaxpets.optimizers.WORST_VALUE, jnp.float32)
     assert jnp.isfinite(worst.sum())
     assert worst[0] < -1e12
 
@@ -27,7 +27,7 @@ def test_protocols_take_plain_functions():
     def dynamics(params, key, obs, action):
         return obs
 
-    fn: jaxpets.DynamicsFn = dynamics
-    rollout: jaxpets.RolloutFn = jaxpets.particle_rollout(fn)
+    fn: jaxpets.typing.DynamicsFn = dynamics
+    rollout: jaxpets.typing.RolloutFn = jaxpets.particle_rollout(fn)
     path = rollout((), jax.random.key(0), jnp.zeros(2), jnp.zeros((3, 4, 1)))
     assert path.shape == (3, 5, 1, 1, 2)

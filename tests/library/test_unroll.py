@@ -23,7 +23,7 @@ def run(planner, state, key, length):
 
 
 def test_start_resets_both(key):
-    state = jaxpets.start(ENV, PLANNER, key)
+    state = jaxpets.start_trial(ENV, PLANNER, key)
     toys.assert_trees_close(state.env, ENV.reset(key), rtol=0)
     toys.assert_trees_close(state.planner, PLANNER.init(), rtol=0)
     assert state.step == 0 and state.step.dtype == jnp.int32
@@ -31,7 +31,7 @@ def test_start_resets_both(key):
 
 @pytest.mark.parametrize("planner", [PLANNER, CHANCE])
 def test_parts_equal_the_whole(planner, key):
-    begin = jaxpets.start(ENV, planner, jax.random.key(1))
+    begin = jaxpets.start_trial(ENV, planner, jax.random.key(1))
     end, transitions, plans = run(planner, begin, key, 12)
     state, parts = begin, []
     for length in (5, 5, 2):
@@ -44,7 +44,7 @@ def test_parts_equal_the_whole(planner, key):
 
 
 def test_transitions_are_what_happened(key):
-    begin = jaxpets.start(ENV, PLANNER, jax.random.key(1))
+    begin = jaxpets.start_trial(ENV, PLANNER, jax.random.key(1))
     end, transitions, plans = run(PLANNER, begin, key, 6)
     np.testing.assert_array_equal(transitions.obs[0], begin.env.obs)
     np.testing.assert_array_equal(transitions.obs[1:], transitions.next_obs[:-1])
@@ -59,7 +59,7 @@ def test_transitions_are_what_happened(key):
 
 def test_every_step_plans_anew_from_its_warm_start(key):
     """The loop written out, with the keys that the docstring promises."""
-    begin = jaxpets.start(ENV, PLANNER, jax.random.key(1))
+    begin = jaxpets.start_trial(ENV, PLANNER, jax.random.key(1))
     _, transitions, _ = run(PLANNER, begin, key, 4)
     step = jax.jit(PLANNER.step)
     env_state, planner_state = begin.env, begin.planner
@@ -71,14 +71,14 @@ def test_every_step_plans_anew_from_its_warm_start(key):
 
 
 def test_random_actions_differ_between_steps_and_keys(key):
-    begin = jaxpets.start(ENV, CHANCE, jax.random.key(1))
+    begin = jaxpets.start_trial(ENV, CHANCE, jax.random.key(1))
     first = run(CHANCE, begin, key, 8)[1].action
     other = run(CHANCE, begin, jax.random.key(5), 8)[1].action
     assert len(np.unique(np.concatenate([first, other]))) == 16
 
 
 def test_bad_arguments_fail_when_traced(key):
-    begin = jaxpets.start(ENV, CHANCE, jax.random.key(1))
+    begin = jaxpets.start_trial(ENV, CHANCE, jax.random.key(1))
     with pytest.raises(ValueError, match="length must be at least 1, got 0"):
         jaxpets.unroll(ENV, CHANCE, PARAMS, key, begin, length=0)
     with pytest.raises(TypeError, match="length must be a Python int"):

@@ -28,7 +28,9 @@ def params(model):
 
 @pytest.fixture(scope="module")
 def fitter(model):
-    return jaxpets.fit(model, optax.adam(1e-3), FitConfig(num_epochs=3, batch_size=8))
+    return jaxpets.fitter(
+        model, optax.adam(1e-3), FitConfig(num_epochs=3, batch_size=8)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,7 @@ def test_an_update_whose_loss_is_not_finite_is_dropped(
     assert 0 < metrics.num_skipped < metrics.num_updates
     # Dropped updates leave the optimizer alone, too.
     assert int(state.opt_state[0].count) == metrics.num_updates - metrics.num_skipped
-    assert jnp.isfinite(metrics.loss)
+    assert jnp.isfinite(metrics.nll)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -69,7 +71,7 @@ def test_metrics_are_means_over_the_updates_that_were_kept(
     _, _, clean = run(data)
     _, _, spoilt = run(data._replace(**{entry: bad}))
     assert spoilt.num_skipped < spoilt.num_updates
-    np.testing.assert_allclose(spoilt.loss, clean.loss, atol=1.0)
+    np.testing.assert_allclose(spoilt.nll, clean.nll, atol=1.0)
     np.testing.assert_allclose(spoilt.mse, clean.mse, rtol=1.0)
 
 
@@ -81,7 +83,7 @@ def test_metrics_without_an_update_that_was_kept_are_nan(params, step, fitter):
     )
     toys.assert_trees_close(after.network, params.network, rtol=0, atol=0)
     assert metrics.num_skipped == metrics.num_updates
-    assert jnp.isnan(metrics.loss) and jnp.isnan(metrics.mse)
+    assert jnp.isnan(metrics.nll) and jnp.isnan(metrics.mse)
 
 
 @pytest.mark.parametrize("size", [5, 19, 24])
@@ -92,11 +94,11 @@ def test_rows_behind_the_data_are_never_looked_at(size):
     params = jax.jit(model.init)(jax.random.key(0))
     data = jax.tree.map(lambda x: jnp.abs(x) + 0.1, toys.transitions(size))
     config = FitConfig(num_epochs=2, batch_size=8, bootstrap=False)
-    fitter = jaxpets.fit(model, optax.adam(1e-3), config)
+    fitter = jaxpets.fitter(model, optax.adam(1e-3), config)
     _, _, metrics = jax.jit(fitter.step)(
         params, jax.random.key(0), fitter.init(params), dataset_of(data)
     )
-    assert metrics.num_skipped == 0 and jnp.isfinite(metrics.loss)
+    assert metrics.num_skipped == 0 and jnp.isfinite(metrics.nll)
 
 
 def test_the_model_stays_usable_after_a_bad_row(model, params, step, fitter):
@@ -118,7 +120,7 @@ def test_an_update_whose_gradient_is_not_finite_is_dropped(model, params):
         # The root has the value 0 and an infinite slope.
         return total + jnp.sqrt(zero * jnp.sum(network.max_logvar)), errors
 
-    fitter = jaxpets.fit(model._replace(loss=loss), optax.adam(1e-3), FitConfig())
+    fitter = jaxpets.fitter(model._replace(loss=loss), optax.adam(1e-3), FitConfig())
     dataset = dataset_of(toys.transitions(40))
     after, _, metrics = jax.jit(fitter.step)(
         params, jax.random.key(0), fitter.init(params), dataset
@@ -133,7 +135,7 @@ def test_max_logvar_never_crosses_min_logvar():
     model = toys.small_ensemble(bound_decay=300.0)
     params = jax.jit(model.init)(jax.random.key(0))
     config = FitConfig(num_epochs=20, batch_size=8)
-    fitter = jaxpets.fit(model, optax.adam(0.3), config)
+    fitter = jaxpets.fitter(model, optax.adam(0.3), config)
     step = jax.jit(fitter.step)
     state, dataset = fitter.init(params), dataset_of(toys.transitions(40))
     met = False
@@ -142,7 +144,7 @@ def test_max_logvar_never_crosses_min_logvar():
         gap = params.network.max_logvar - params.network.min_logvar
         assert jnp.all(gap > 0)
         met |= bool(jnp.any(gap < 0.2))
-        assert jnp.all(jaxpets.max_variance(params) > 1e-12)
+        assert jnp.all(jaxpets.rewards.max_variance(params) > 1e-12)
     assert met  # the case is the one meant
 
 
@@ -158,14 +160,14 @@ def test_bad_settings_fail_when_built():
 
 
 def test_a_raw_key_fails_when_traced(fitter, params):
-    dataset = jaxpets.init_dataset(CAPACITY, 2, 1)
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     with pytest.raises(TypeError, match="key must be a typed key"):
         fitter.step(params, jax.random.PRNGKey(0), fitter.init(params), dataset)
 
 
 @pytest.mark.parametrize("sizes", [(3, 1), (2, 2)])
 def test_a_dataset_of_other_sizes_fails_when_traced(fitter, params, sizes):
-    dataset = jaxpets.init_dataset(CAPACITY, *sizes)
+    dataset = jaxpets.datasets.init(CAPACITY, *sizes)
     with pytest.raises(ValueError, match=r"data\S* must be float32\[.*got float32"):
         jax.eval_shape(
             fitter.step, params, jax.random.key(0), fitter.init(params), dataset

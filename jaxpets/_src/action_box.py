@@ -1,0 +1,79 @@
+"""The box of valid actions, in which every search looks for a sequence."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+from jax.typing import ArrayLike
+
+
+class ActionBox(NamedTuple):
+    """What a search needs to know of the action bounds.
+
+    Attributes:
+      low: `[A]`.
+      high: `[A]`.
+      center: `[A]`, where a search without a warm start begins.
+      half_width: `[A]`, the unit of a box scaled to `[-1, 1]`.
+    """
+
+    low: Array
+    high: Array
+    center: Array
+    half_width: Array
+
+    def start(self, horizon: int) -> Array:
+        """Returns the sequence `[H, A]` that stays in the middle of the box."""
+        return jnp.broadcast_to(self.center, (horizon, *self.center.shape))
+
+    def clip(self, actions: Array) -> Array:
+        """Returns actions `[..., A]` inside the box."""
+        return jnp.clip(actions, self.low, self.high)
+
+    def shift(self, sequences: Array) -> Array:
+        """Drops the first step of `[..., H, A]` and pads with the middle of the box."""
+        last = jnp.broadcast_to(self.center, sequences[..., :1, :].shape)
+        return jnp.concatenate([sequences[..., 1:, :], last], axis=-2)
+
+
+def action_box(action_low: ArrayLike, action_high: ArrayLike) -> ActionBox:
+    """Returns the box between two bounds.
+
+    Args:
+      action_low: `[A]`, finite numbers; they may be traced.
+      action_high: `[A]`, above action_low in every entry.
+
+    Raises:
+      TypeError, ValueError: for bounds that are no box.
+    """
+    _check(action_low, action_high)
+    low = jnp.asarray(action_low, jnp.float32)
+    high = jnp.asarray(action_high, jnp.float32)
+    return ActionBox(low, high, (low + high) / 2, (high - low) / 2)
+
+
+def _check(action_low: ArrayLike, action_high: ArrayLike) -> None:
+    """Raises unless the two are `[A]`, finite and `low < high` in every entry."""
+    bounds = (action_low, action_high)
+    for name, bound in zip(("action_low", "action_high"), bounds, strict=True):
+        if not isinstance(bound, (Array, np.ndarray)) or bound.dtype.kind not in "fiu":
+            kind = getattr(bound, "dtype", type(bound).__name__)
+            raise TypeError(f"{name} must be numbers [A], got {bound!r} ({kind}).")
+    shape = jnp.shape(action_low)
+    if len(shape) != 1 or shape[0] == 0:
+        raise ValueError(f"action_low must be [A] with A > 0, got {list(shape)}.")
+    if jnp.shape(action_high) != shape:
+        raise ValueError(
+            f"action_high must be {list(shape)} as action_low, got "
+            f"{list(jnp.shape(action_high))}."
+        )
+    if any(isinstance(bound, Tracer) for bound in bounds):
+        return
+    low, high = np.asarray(action_low), np.asarray(action_high)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        raise ValueError(
+            "action_low and action_high must be finite with low < high, "
+            f"got {low.tolist()} and {high.tolist()}."
+        )

@@ -1,0 +1,48 @@
+"""The law of a ModelSpace, tried on data."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxpets._src.checks import check_array, check_record
+from jaxpets._src.types import ModelSpace
+
+
+def check_space(
+    space: ModelSpace, obs: Array, next_obs: Array, *, tolerance: float = 1e-4
+) -> None:
+    """Raises unless a model can be learned in these coordinates.
+
+    Tries the law `next_obs(o, target(o, x)) == x`, and that features and targets are
+    finite and of the right shape. A space that breaks the law trains as well as any
+    other and predicts nonsense. Call it once, on real transitions, outside `jit`.
+
+    Args:
+      space: what to try.
+      obs: `[T, D]`, as a Transition has them.
+      next_obs: `[T, D]`.
+      tolerance: how far an entry may be off, as a share of the largest number in it.
+
+    Raises:
+      TypeError, ValueError: naming the entry that is wrong, and by how much.
+    """
+    check_record("space", space, ModelSpace)
+    check_array("obs", obs, ["T", "D"])
+    check_array("next_obs", next_obs, list(jnp.shape(obs)))
+    num_rows, obs_size = jnp.shape(obs)
+    features, target = space.features(obs), space.target(obs, next_obs)
+    check_array("space.features's result", features, [num_rows, "F"])
+    check_array("space.target's result", target, [num_rows, obs_size])
+    for name, value in (("features", features), ("target", target)):
+        if not np.isfinite(value).all():
+            raise ValueError(f"space.{name} must return finite numbers.")
+    rebuilt = space.next_obs(obs, target)
+    check_array("space.next_obs's result", rebuilt, [num_rows, obs_size])
+    error = np.abs(np.asarray(rebuilt) - np.asarray(next_obs)).max(axis=0)
+    scale = np.maximum(np.abs(next_obs).max(axis=0), 1.0)
+    worst = int(np.argmax(error / scale))
+    if not error[worst] <= tolerance * scale[worst]:
+        raise ValueError(
+            "space.next_obs(obs, space.target(obs, next_obs)) must be next_obs, but "
+            f"entry {worst} is off by up to {error[worst]:.3g}."
+        )

@@ -1,0 +1,69 @@
+"""The numbers of an ensemble: sizes of its networks and coefficients of its loss."""
+
+import dataclasses
+from typing import Any
+
+from jaxpets._src.checks import check_count, check_counts, check_real, check_reals
+from jaxpets._src.network import Precision
+
+
+@dataclasses.dataclass(frozen=True)
+class EnsembleConfig:
+    """The network and loss of PETS on HalfCheetah.
+
+    Attributes:
+      num_members: E.
+      hidden_sizes: widths of the hidden layers.
+      weight_decays: one per layer, the output layer last; each times `sum(w^2) / 2`.
+        One number is that of every layer. None is PETS's: 2.5e-5 for the first layer,
+        5e-5 for the second, 1e-4 for the output and 7.5e-5 for all between.
+      bound_decay: pull of the loss on the log-variance bounds.
+      precision: of the matrix products. It changes no parameter, so an ensemble may be
+        trained in one precision and planned with in another.
+      state_margin: imagined states may leave the range of the data by this share of
+        its width; None leaves them free. Not in PETS: without it a learned model can
+        blow up while every number stays finite, and a planner that looks for
+        disagreement finds that.
+    """
+
+    num_members: int = 5
+    hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
+    weight_decays: float | tuple[float, ...] | None = None
+    bound_decay: float = 0.01
+    precision: Precision = Precision.TF32
+    state_margin: float | None = 0.5
+
+    def __post_init__(self) -> None:
+        check_count("num_members", self.num_members)
+        check_counts("hidden_sizes", self.hidden_sizes)
+        _check_decays(self.weight_decays, len(self.hidden_sizes) + 1)
+        check_real("bound_decay", self.bound_decay, 0.0)
+        if not isinstance(self.precision, Precision):
+            raise TypeError(f"precision must be a Precision, got {self.precision!r}.")
+        if self.state_margin is not None:
+            check_real("state_margin", self.state_margin, 0.0)
+
+
+def _check_decays(decays: Any, num_layers: int) -> None:
+    if decays is None:
+        return
+    if not isinstance(decays, (tuple, list)):
+        check_real("weight_decays", decays, 0.0)
+        return
+    check_reals("weight_decays", decays, 0.0)
+    if len(decays) != num_layers:
+        raise ValueError(
+            f"weight_decays must be a number or one per layer ({num_layers}), got "
+            f"{len(decays)}."
+        )
+
+
+def layer_decays(config: EnsembleConfig) -> tuple[float, ...]:
+    """Returns the weight decay of every layer, the output layer last."""
+    decays, num_hidden = config.weight_decays, len(config.hidden_sizes)
+    if isinstance(decays, (tuple, list)):
+        return tuple(decays)
+    if decays is not None:
+        return (decays,) * (num_hidden + 1)
+    inner = (2.5e-5, 5e-5, *(7.5e-5,) * num_hidden)[:num_hidden]
+    return (*inner, 1e-4)

@@ -1,0 +1,288 @@
+"""Training of the ensemble: bootstraps, epochs and minibatches in one program."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from jaxpets._src.checks import (
+    check_count,
+    check_flag,
+    check_key,
+    check_real,
+    check_record,
+)
+from jaxpets._src.ensemble import Ensemble
+from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.types import Dataset
+
+# Updates between two looks at how many there are: a GPU's host waits for each.
+_UPDATES_AT_ONCE = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class FitConfig:
+    """How often and in what portions the data are shown; the defaults are PETS's.
+
+    Attributes:
+      num_epochs: passes over the data per call.
+      batch_size: rows per member and gradient step.
+      final_rate: the step size at the end of a call as a share of the optimizer's; it
+        falls along a cosine and starts anew with every call (SGDR, Loshchilov and
+        Hutter, 2017). 1 is PETS's constant rate, whose last steps leave noise in the
+        weights that looks like disagreement.
+      bootstrap: whether a member sees its own draw of rows, which leaves out a third
+        of them, or every row, and differs by its first weights and order alone (deep
+        ensembles, Lakshminarayanan et al., 2017).
+    """
+
+    num_epochs: int = 5
+    batch_size: int = 32
+    final_rate: float = 1.0
+    bootstrap: bool = True
+
+    def __post_init__(self) -> None:
+        check_count("num_epochs", self.num_epochs)
+        check_count("batch_size", self.batch_size)
+        check_real("final_rate", self.final_rate, 0.0, 1.0)
+        check_flag("bootstrap", self.bootstrap)
+
+
+class FitState(NamedTuple):
+    """The warm start of training.
+
+    Attributes:
+      opt_state: what the optimizer keeps between calls.
+    """
+
+    opt_state: Any
+
+
+class FitMetrics(NamedTuple):
+    """How the last call went.
+
+    Means leave out dropped updates; without any update that counts they are NaN.
+
+    Attributes:
+      nll: `[]`, mean over the last epoch of the negative log-likelihood that the
+        ensemble minimises, without the penalties of its loss.
+      mse: `[]`, mean squared error of the predicted mean, over members and dimensions,
+        in units of the targets squared.
+      num_updates: `[]` int32.
+      num_skipped: `[]` int32, updates dropped because they were not finite.
+    """
+
+    nll: Array
+    mse: Array
+    num_updates: Array
+    num_skipped: Array
+
+
+class Fitter(NamedTuple):
+    """Training as a pure function.
+
+    Attributes:
+      init: `(EnsembleParams) -> FitState`.
+      step: `(params, key, state, dataset) -> (params, state, FitMetrics)`.
+    """
+
+    init: Callable[[EnsembleParams], FitState]
+    step: Callable[
+        [EnsembleParams, Array, FitState, Dataset],
+        tuple[EnsembleParams, FitState, FitMetrics],
+    ]
+
+
+class _Batch(NamedTuple):
+    inputs: Array  # [E, batch_size, F + A]
+    targets: Array  # [E, batch_size, D]
+    weight: Array  # [batch_size], sums to one; 0 past the end of the data
+    count: Array  # [] rows that count
+
+
+class _Totals(NamedTuple):
+    nll: Array  # [] sum over rows
+    mse: Array  # [] sum over rows
+    count: Array  # [] rows
+
+
+class _Progress(NamedTuple):
+    network: Any
+    opt_state: Any
+    num_skipped: Array  # [] int32
+    totals: _Totals  # of this epoch
+
+
+def fitter(
+    ensemble: Ensemble, optimizer: optax.GradientTransformation, config: FitConfig
+) -> Fitter:
+    """Builds the trainer of PETS.
+
+    One call refits the scaler on all data, draws a bootstrap per member (as many rows
+    as there are, with replacement; section 3.2) unless `config` says otherwise, and
+    runs `num_epochs` epochs over it, shuffled anew for each member and epoch. Networks
+    and optimizer go on from where the last call left them. The number of updates
+    follows the data, so a growing dataset needs no retrace; the last batch of an epoch
+    is masked to what is left.
+
+    To train several seeds at once, see `jaxpets.over_seeds`, or map `step` over
+    `(0, 0, 0, jaxpets.datasets.AXES)`.
+
+    An update that is not finite is dropped and counted. After every update the
+    variance bounds are put in order, see `Ensemble.project`.
+
+    Args:
+      ensemble: what to train; see there for what is read of an ensemble of your own.
+      optimizer: for example `optax.adam(1e-3)`.
+      config: how often and in what portions the data are shown.
+
+    Returns:
+      A Fitter.
+
+    Raises:
+      TypeError: if an argument is not what it should be.
+    """
+    check_record("ensemble", ensemble, Ensemble)
+    check_record("config", config, FitConfig)
+    if not isinstance(optimizer, optax.GradientTransformation):
+        kind = type(optimizer).__name__
+        raise TypeError(
+            f"optimizer must be of optax, as optax.adam(1e-3), got {optimizer!r} "
+            f"({kind})."
+        )
+
+    def init(params: EnsembleParams) -> FitState:
+        check_record("params", params, EnsembleParams)
+        return FitState(optimizer.init(params.network))
+
+    def update(progress: _Progress, batch: _Batch, done: Array) -> _Progress:
+        network, opt_state, num_skipped, totals = progress
+        grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
+        # The whole loss is not asked for: the value of its penalties, which only their
+        # gradients need not, would cost a fifth of the step's programs on a GPU.
+        (_, (nll, mse)), grads = grad_fn(network, *batch[:3])
+        # Optimizers of optax do not trace under strict promotion, if a caller set it.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, new_opt_state = optimizer.update(grads, opt_state, network)
+            if config.final_rate < 1.0:
+                rate = optax.cosine_decay_schedule(1.0, 1, config.final_rate)(done)
+                updates = jax.tree.map(lambda x: rate * x, updates)
+        new_network = ensemble.project(optax.apply_updates(network, updates))
+
+        has_rows = batch.count > 0.0
+        finite = _all_finite(ensemble.sentinels(grads), nll)
+        good = has_rows & finite
+        network, opt_state = _where(
+            good, (new_network, new_opt_state), (network, opt_state)
+        )
+        mean = _Totals(nll, mse, jnp.ones_like(nll))
+        totals = jax.tree.map(
+            lambda total, x: total + jnp.where(good, batch.count * x, 0.0), totals, mean
+        )
+        num_skipped += (has_rows & jnp.logical_not(finite)).astype(jnp.int32)
+        return _Progress(network, opt_state, num_skipped, totals)
+
+    def step(
+        params: EnsembleParams, key: Array, state: FitState, dataset: Dataset
+    ) -> tuple[EnsembleParams, FitState, FitMetrics]:
+        check_record("params", params, EnsembleParams)
+        check_key("key", key)
+        check_record("state", state, FitState)
+        check_record("dataset", dataset, Dataset)
+        size = dataset.size
+        scaler = ensemble.fit_scaler(dataset.data, size)
+        data = ensemble.encode(scaler, dataset.data)
+        rows_key, epochs_key = jax.random.split(key)
+        shape = (ensemble.num_members, dataset.data.obs.shape[0])
+        rows = _bootstrap(rows_key, config, shape, size)
+        num_batches = (size + config.batch_size - 1) // config.batch_size
+
+        def epoch(progress: _Progress, number_and_key: tuple) -> tuple[_Progress, None]:
+            number, key = number_and_key
+            shuffled = _shuffle(key, rows, size)
+
+            def one(i: Array, progress: _Progress) -> _Progress:
+                batch = _minibatch(data, shuffled, i, config.batch_size, size)
+                done = number + i / jnp.maximum(num_batches, 1)
+                return update(progress, batch, done / config.num_epochs)
+
+            return _loop(num_batches, one, progress._replace(totals=_zeros())), None
+
+        start = _Progress(
+            params.network, state.opt_state, jnp.zeros((), jnp.int32), _zeros()
+        )
+        numbers = jnp.arange(config.num_epochs, dtype=jnp.float32)
+        keys = jax.random.split(epochs_key, config.num_epochs)
+        end, _ = jax.lax.scan(epoch, start, (numbers, keys))
+        metrics = FitMetrics(
+            nll=end.totals.nll / end.totals.count,
+            mse=end.totals.mse / end.totals.count,
+            num_updates=(num_batches * config.num_epochs).astype(jnp.int32),
+            num_skipped=end.num_skipped,
+        )
+        return EnsembleParams(end.network, scaler), FitState(end.opt_state), metrics
+
+    return Fitter(init, step)
+
+
+def _bootstrap(
+    key: Array, config: FitConfig, shape: tuple[int, int], size: Array
+) -> Array:
+    """Returns which rows each member is shown, `[E, C]`, of which `size` count."""
+    if config.bootstrap:
+        return jax.random.randint(key, shape, 0, jnp.maximum(size, 1))
+    return jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32), shape)
+
+
+def _shuffle(key: Array, rows: Array, size: Array) -> Array:
+    """Returns the rows `[E, C]` in another order; the first `size` stay the first."""
+    order = jax.random.uniform(key, rows.shape, jnp.float32)
+    order = jnp.where(jnp.arange(rows.shape[1]) < size, order, jnp.inf)
+    return jnp.take_along_axis(rows, jnp.argsort(order, axis=1), axis=1)
+
+
+def _minibatch(
+    data: tuple[Array, Array], rows: Array, i: Array, batch_size: int, size: Array
+) -> _Batch:
+    """Returns batch i of the data; there may be few rows left for it, or none."""
+    position = i * batch_size + jnp.arange(batch_size, dtype=jnp.int32)
+    # Past the data lies what need not be finite, which no weight masks.
+    within = jnp.minimum(position, size - 1)
+    picked = jnp.take(rows, within, axis=1, mode="clip")
+    used = (position < size).astype(jnp.float32)
+    count = jnp.float32(jnp.clip(size - i * batch_size, 0, batch_size))
+    inputs, targets = data
+    weight = used / jnp.maximum(count, 1.0)
+    return _Batch(inputs[picked], targets[picked], weight, count)
+
+
+def _loop(
+    length: Array, body: Callable[[Array, _Progress], _Progress], progress: _Progress
+) -> _Progress:
+    """Runs `body` at least `length` times, in turns of a length that is known."""
+
+    def turn(i: Array, progress: _Progress) -> _Progress:
+        def one(j: Array, progress: _Progress) -> _Progress:
+            return body(i * _UPDATES_AT_ONCE + j, progress)
+
+        return jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, progress)
+
+    num_turns = (length + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
+    return jax.lax.fori_loop(0, num_turns, turn, progress)
+
+
+def _zeros() -> _Totals:
+    return _Totals(*(jnp.zeros((), jnp.float32),) * 3)
+
+
+def _all_finite(*trees: Any) -> Array:
+    leaves = jax.tree.leaves(trees)
+    return jnp.all(jnp.isfinite(jnp.concatenate([x.ravel() for x in leaves])))
+
+
+def _where(condition: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

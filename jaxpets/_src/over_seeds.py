@@ -1,0 +1,82 @@
+"""Many seeds of one learner, side by side in one program."""
+
+from typing import Any
+
+import jax
+from jax import Array
+
+from jaxpets._src import dataset as datasets
+from jaxpets._src.checks import check_count, check_record
+from jaxpets._src.fitter import FitMetrics
+from jaxpets._src.learner import Learner, LearnerState, TrialOutput
+from jaxpets._src.types import Planner, Transition
+
+_MAPPED: Any = 0
+# The axes of a learner over seeds. All have seen equally much, so the size of their
+# datasets is one number; see `datasets.AXES` for what that is worth.
+SEED_AXES = LearnerState(_MAPPED, _MAPPED, datasets.AXES, _MAPPED)
+
+
+def over_seeds(learner: Learner, num_seeds: int) -> Learner:
+    """Maps a learner over a new leading axis of seeds.
+
+    It is `jax.vmap` with the axes SEED_AXES: every leaf of the state has the axis but
+    for the size and the cursor of the dataset, which all seeds share. A plain vmap is
+    the same learner and takes a third longer to train. An axis of one seed is left out
+    of the programs: XLA does not simplify gathers over it.
+
+    Args:
+      learner: of one seed; may itself be mapped over seeds.
+      num_seeds: S.
+
+    Returns:
+      A Learner whose `init`, `learn` and `step` take keys `[S]`, states over SEED_AXES
+      and transitions `[S, T, ...]`, and return the same. The planner of `step` is that
+      of one seed.
+
+    Raises:
+      TypeError, ValueError: unless num_seeds is a positive Python integer.
+    """
+    check_record("learner", learner, Learner)
+    check_count("num_seeds", num_seeds)
+
+    def init(keys: Array) -> LearnerState:
+        return jax.vmap(learner.init, out_axes=SEED_AXES)(keys)
+
+    def learn(
+        keys: Array, state: LearnerState, transitions: Transition
+    ) -> tuple[LearnerState, FitMetrics]:
+        if num_seeds == 1:
+            state, metrics = learner.learn(keys[0], _only(state), _only(transitions))
+            return _as_one_of_many(state), _many(metrics)
+        mapped = jax.vmap(learner.learn, (0, SEED_AXES, 0), (SEED_AXES, 0))
+        return mapped(keys, state, transitions)
+
+    def step(
+        planner: Planner, keys: Array, state: LearnerState
+    ) -> tuple[LearnerState, TrialOutput]:
+        def one(key: Array, state: LearnerState) -> tuple[LearnerState, TrialOutput]:
+            return learner.step(planner, key, state)
+
+        if num_seeds == 1:
+            state, output = one(keys[0], _only(state))
+            return _as_one_of_many(state), _many(output)
+        return jax.vmap(one, (0, SEED_AXES), (SEED_AXES, 0))(keys, state)
+
+    return Learner(init, learn, step)
+
+
+def _only(tree: Any) -> Any:
+    """Drops the axis of the seeds; what they share has none."""
+    return jax.tree.map(lambda x: x[0] if x.ndim else x, tree)
+
+
+def _many(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x[None], tree)
+
+
+def _as_one_of_many(state: LearnerState) -> LearnerState:
+    """Adds the axis of the seeds to all but what they share."""
+    shared = {name: getattr(state.dataset, name) for name in ("size", "cursor")}
+    state = _many(state)
+    return state._replace(dataset=state.dataset._replace(**shared))

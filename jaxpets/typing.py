@@ -1,0 +1,52 @@
+"""Everything that one annotates with: the contracts of functions, and the records."""
+
+from jaxpets._src.ensemble import Ensemble
+from jaxpets._src.ensemble_params import EnsembleParams, NetworkParams, Scaler
+from jaxpets._src.fitter import FitMetrics, FitState, Fitter
+from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput
+from jaxpets._src.types import (
+    Dataset,
+    DynamicsFn,
+    Env,
+    EnvState,
+    ModelSpace,
+    ObjectiveFn,
+    Planner,
+    PlanOutput,
+    PlanParams,
+    RewardFn,
+    RolloutFn,
+    Solution,
+    TrajectoryOptimizer,
+    Transition,
+)
+from jaxpets._src.unroll import UnrollState
+
+__all__ = [
+    "Dataset",
+    "DynamicsFn",
+    "Ensemble",
+    "EnsembleParams",
+    "Env",
+    "EnvState",
+    "FitMetrics",
+    "FitState",
+    "Fitter",
+    "Learner",
+    "LearnerState",
+    "ModelSpace",
+    "NetworkParams",
+    "ObjectiveFn",
+    "PlanOutput",
+    "PlanParams",
+    "Planner",
+    "RewardData",
+    "RewardFn",
+    "RolloutFn",
+    "Scaler",
+    "Solution",
+    "TrajectoryOptimizer",
+    "Transition",
+    "TrialOutput",
+    "UnrollState",
+]
