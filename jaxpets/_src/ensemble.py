@@ -85,7 +85,7 @@ class EnsembleParams(NamedTuple):
 
 
 class Ensemble(NamedTuple):
-    """Pure functions of one ensemble.
+    """Pure functions of one ensemble, and what it was built from.
 
     init: `(key) -> EnsembleParams`.
     predict: `(params, obs [E, B, D], action [B, A]) -> (mean, variance)`, both
@@ -96,6 +96,10 @@ class Ensemble(NamedTuple):
     loss: `(network, inputs [E, B, F+A], targets [E, B, D], weight [B]) -> (loss, (nll,
       mse))`; `weight` sums to one, `nll` is the loss without its penalties.
     project: `(network) -> network` with variance bounds in order.
+    num_members: E.
+    obs_size: D.
+    action_size: A.
+    config, space: as `jaxpets.ensemble` got them; None in an ensemble of your own.
     """
 
     init: Callable[[Array], EnsembleParams]
@@ -107,6 +111,11 @@ class Ensemble(NamedTuple):
         [NetworkParams, Array, Array, Array], tuple[Array, tuple[Array, Array]]
     ]
     project: Callable[[NetworkParams], NetworkParams]
+    num_members: int
+    obs_size: int
+    action_size: int
+    config: EnsembleConfig | None = None
+    space: ModelSpace | None = None
 
 
 # The bounds may not cross: past that point nothing holds max_logvar, which is the
@@ -261,4 +270,17 @@ def ensemble(
         floor = network.min_logvar + _MIN_BOUND_GAP
         return network._replace(max_logvar=jnp.maximum(network.max_logvar, floor))
 
-    return Ensemble(init, predict, sample, fit_scaler, encode, loss, project)
+    return Ensemble(
+        init,
+        predict,
+        sample,
+        fit_scaler,
+        encode,
+        loss,
+        project,
+        num_members=config.num_members,
+        obs_size=obs_size,
+        action_size=action_size,
+        config=config,
+        space=space,
+    )
