@@ -8,7 +8,6 @@ import argparse
 import dataclasses
 import functools
 import itertools
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -118,17 +117,12 @@ def rollout_fn(
         )
     if jax.default_backend() == "cpu" and precision != "f32":
         raise SystemExit("no kernel to time: that of a CPU is --precision f32 only")
-    try:
-        with warnings.catch_warnings(action="error"):
-            return jaxpets.fused_rollout(
-                ensemble_config(size, precision),
-                half_cheetah.model_space(),
-                obs_size=half_cheetah.OBS_SIZE,
-                action_size=half_cheetah.ACTION_SIZE,
-                num_particles=size.num_particles,
-            )
-    except UserWarning as warning:
-        raise SystemExit(f"no kernel to time: {warning}") from warning
+    fused = jaxpets.fused_rollout(
+        model(size, precision), num_particles=size.num_particles
+    )
+    if not fused.uses_kernel:
+        raise SystemExit(f"no kernel to time: {fused.reason}")
+    return fused
 
 
 def rollout_work(

@@ -57,8 +57,7 @@ def build(config: Config) -> Parts:
     def planner(
         reward_fn: jaxpets.typing.RewardFn, search: PlannerNumbers
     ) -> jaxpets.Planner:
-        rollout = _rollout(size, search)
-        is_kernel = hasattr(rollout, "bind")  # and not the scan in its place
+        rollout, is_kernel = _rollout(size, search)
         unroll = is_kernel and jax.default_backend() == "gpu"
         return jaxpets.plan(rollout, reward_fn, optimizer(search, env, unroll))
 
@@ -120,22 +119,18 @@ def _ensemble(
 
 def _rollout(
     size: jaxpets.EnsembleConfig, search: PlannerNumbers
-) -> jaxpets.typing.RolloutFn:
+) -> tuple[jaxpets.typing.RolloutFn, bool]:
+    """Returns the rollout of a search, and whether it is a kernel."""
     precision = jaxpets.Precision(search.precision)
+    model = _ensemble(size, precision)
     may_have_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
     if search.fused and may_have_kernel.get(jax.default_backend(), False):
-        return jaxpets.fused_rollout(
-            dataclasses.replace(size, precision=precision),
-            half_cheetah.model_space(),
-            obs_size=half_cheetah.OBS_SIZE,
-            action_size=half_cheetah.ACTION_SIZE,
-            num_particles=search.num_particles,
-        )
-    return jaxpets.particle_rollout(
-        _ensemble(size, precision).sample,
-        num_members=size.num_members,
-        num_particles=search.num_particles,
+        rollout = jaxpets.fused_rollout(model, num_particles=search.num_particles)
+        return rollout, rollout.uses_kernel
+    rollout = jaxpets.particle_rollout(
+        model.sample, num_members=size.num_members, num_particles=search.num_particles
     )
+    return rollout, False
 
 
 def optimizer(

@@ -3,12 +3,14 @@
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams, NetworkParams, Scaler
 from jaxpets._src.fitter import FitMetrics, FitState, Fitter
+from jaxpets._src.fused_rollout import FusedRollout
 from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput
 from jaxpets._src.types import (
     Dataset,
     DynamicsFn,
     Env,
     EnvState,
+    ModelRolloutFn,
     ModelSpace,
     ObjectiveFn,
     Planner,
@@ -32,8 +34,10 @@ __all__ = [
     "FitMetrics",
     "FitState",
     "Fitter",
+    "FusedRollout",
     "Learner",
     "LearnerState",
+    "ModelRolloutFn",
     "ModelSpace",
     "NetworkParams",
     "ObjectiveFn",

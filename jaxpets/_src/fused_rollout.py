@@ -1,6 +1,7 @@
 """Trajectory sampling as one kernel: all steps of all particles in one call."""
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -9,134 +10,172 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_flag
+from jaxpets._src.checks import check_array, check_key
 from jaxpets._src.chunks import WINDOW
-from jaxpets._src.ensemble import ensemble
+from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig
 from jaxpets._src.ensemble_params import EnsembleParams, imagined_range
 from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
-from jaxpets._src.kernel.row_code import UnsupportedError, row_function
-from jaxpets._src.kernel.shape import KernelShape
-from jaxpets._src.kernel.tiles import TileShape
+from jaxpets._src.kernel.cpu_layout import CpuLayout
+from jaxpets._src.kernel.gpu_layout import GpuLayout
+from jaxpets._src.kernel.jaxpr_to_cpp import UnsupportedError, cpp_function
 from jaxpets._src.network import Precision
 from jaxpets._src.rollout import particle_rollout
-from jaxpets._src.types import ModelSpace, RolloutFn
+from jaxpets._src.types import ModelSpace
 
 
-def fused_rollout(
-    config: EnsembleConfig,
-    space: ModelSpace,
-    *,
-    obs_size: int,
-    action_size: int,
-    num_particles: int,
-    interpret: bool = False,
-) -> RolloutFn:
+@dataclasses.dataclass(frozen=True)
+class FusedRollout:
+    """What `fused_rollout` returns: a ModelRolloutFn that may be asked what it runs.
+
+    Attributes:
+      bind: `(EnsembleParams) -> (key, obs, actions) -> path`; lays the weights out for
+        the kernel, once for many calls.
+      reason: why the scan runs and no kernel; empty if the kernel does.
+    """
+
+    bind: Callable[[EnsembleParams], Callable[[Array, Array, Array], Array]]
+    reason: str = ""
+
+    @property
+    def uses_kernel(self) -> bool:
+        """Whether a kernel was built; a call with another kind of key still scans."""
+        return not self.reason
+
+    def __call__(
+        self, params: EnsembleParams, key: Array, obs: Array, actions: Array, /
+    ) -> Array:
+        """Imagines, see RolloutFn."""
+        return self.bind(params)(key, obs, actions)
+
+
+def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
     """Builds the particle rollout of an ensemble as one kernel, for H100s and CPUs.
 
-    It computes what `particle_rollout(ensemble(config, space, ...).sample, ...)` does,
-    with the same noise for the same key. On a CPU products read and add up float32,
-    whatever the precision. On a GPU they read float16 and add up in float32: closer to
-    float32 than the scan in bfloat16, but an input of the network, or of one of its
-    layers, beyond 65504 is infinite and leads to NaN, which a planner counts as the
-    worst. The kernel is for the kind of the first device of `jax.devices()`; on another
-    kind a call fails. Where there can be none the scan runs, in the precision of
-    `config`, and a warning of one line says why:
+    It computes what `particle_rollout(model.sample, ...)` does, with the same noise for
+    the same key. On a CPU products read and add up float32, whatever the precision. On
+    a GPU they read float16 and add up in float32: closer to float32 than the scan in
+    bfloat16, but an input of the network, or of one of its layers, beyond 65504 is
+    infinite and leads to NaN, which a planner counts as the worst. The kernel is for
+    the kind of the first device of `jax.devices()`; on another kind a call fails. Where
+    there can be none the scan runs, in the precision of the model. The result then
+    says why in `reason`, `uses_kernel` is False, and a warning of one line is given:
 
-    - `space` does more than arithmetic on single entries, moving them and summing, or
-      makes next observations of another size;
+    - the model's space does more than arithmetic on single entries, moving them and
+      summing, or makes next observations of another size;
     - there is no compiler (nvcc; c++, g++ or clang++): the kernel is built for the
-      model at the first call, in half a minute on a GPU and in seconds on a CPU, and
-      kept in the user's cache folder;
-    - keys are not of JAX's default kind, partitionable threefry;
+      model here, in half a minute on a GPU and in seconds on a CPU, and kept in the
+      user's cache folder;
+    - keys are not of JAX's default kind, partitionable threefry (only a call can know:
+      it warns);
     - the device is neither a CPU nor a GPU of compute capability 9.0 (H100, H200,
       GH200);
-    - on a GPU, `config.precision` is not BF16, a hidden layer has more than 256 units,
-      an observation more than 128 entries, or features and action together more than
-      256.
+    - on a GPU, the precision is not BF16, a hidden layer has more than 256 units, an
+      observation more than 128 entries, or features and action together more than 256.
 
     Any number of members, particles, candidates, steps and hidden layers will do, and
     any nest of up to four `jax.vmap`.
 
     Args:
-      config: of the ensemble.
-      space: coordinates of the ensemble.
-      obs_size: D.
-      action_size: A.
+      model: as `jaxpets.ensemble` built it. The kernel is made from its config and
+        space: a `sample` of your own in their place would not be seen.
       num_particles: E * P, over all members.
-      interpret: run the GPU kernel's arithmetic on the CPU, slowly, for tests.
 
     Returns:
-      A RolloutFn whose params are the ensemble's, and whose start is `[D]`.
+      A FusedRollout whose params are the ensemble's, and whose start is `[D]`.
 
     Raises:
-      TypeError, ValueError: as `ensemble` and `particle_rollout`.
+      TypeError: if model is no Ensemble.
+      ValueError: if model was not built by `jaxpets.ensemble`, or num_particles is not
+        a multiple of the number of members.
     """
-    check_flag("interpret", interpret)
-    model = ensemble(config, space, obs_size=obs_size, action_size=action_size)
+    kind = _kind_for(jax.devices()[0])
+    rollout = rollout_of_kind(model, num_particles, kind)
+    if not rollout.uses_kernel:
+        warnings.warn(f"fused_rollout runs as a scan: {rollout.reason}.", stacklevel=2)
+    return rollout
+
+
+def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRollout:
+    """Builds a `fused_rollout` with one kind of kernel, and does not warn of a scan."""
+    config, space = _origin(model)
     scan = particle_rollout(
-        model.sample, num_members=config.num_members, num_particles=num_particles
+        model.sample, num_members=model.num_members, num_particles=num_particles
     )
-    feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
-    sizes = (obs_size, action_size, feature_size, config.hidden_sizes)
-    device = jax.devices()[0]
     try:
-        if device.platform == "cpu" and not interpret:
-            kind, shape = Kind.CPU, TileShape(*sizes)
-        else:
-            kind = Kind.REFERENCE if interpret else Kind.GPU
-            shape = KernelShape(*sizes)
-            _check_shape(config, shape)
-        if kind is Kind.GPU:
-            _check_device(device)
-        target = _target(config, space, shape, kind)
+        layout = _layout(model, config, space, kind)
+        target = load_kernel(_model_header(config, space, layout, kind), kind)
     except (BuildError, UnsupportedError) as error:
-        warnings.warn(f"fused_rollout runs as a scan: {error}.", stacklevel=2)
-        return scan
+        return FusedRollout(lambda params: functools.partial(scan, params), str(error))
 
     def bind(params: EnsembleParams) -> Callable[[Array, Array, Array], Array]:
         layers = params.network.members["params"]
-        weights = shape.pack([layers[f"layer_{i}"] for i in range(len(layers))])
+        weights = layout.pack([layers[f"layer_{i}"] for i in range(len(layers))])
         shared = _shared(config, params)
 
         def rollout(key: Array, obs: Array, actions: Array) -> Array:
-            check_array("obs", obs, [obs_size])
-            check_array("actions", actions, ["N", "H", action_size])
+            check_key("key", key)
+            check_array("obs", obs, [model.obs_size])
+            check_array("actions", actions, ["N", "H", model.action_size])
             if not _is_counted(key):
                 problem = "keys are not partitionable threefry"
                 warnings.warn(f"fused_rollout runs as a scan: {problem}.", stacklevel=2)
                 return scan(params, key, obs, actions)
             # The scan knows what params must be; the kernel would read past their end.
-            path = jax.eval_shape(scan, params, key, obs, actions)
+            path: jax.ShapeDtypeStruct = jax.eval_shape(scan, params, key, obs, actions)
             num_samples, horizon, _ = actions.shape
             call = jax.ffi.ffi_call(target, path, vmap_method="expand_dims")
-            return call(weights, shared, _keys(key, horizon, num_samples), obs, actions)
+            keys = _keys(key, horizon, num_samples)
+            return call(weights, shared, keys, obs, actions)
 
         return rollout
 
-    return _FusedRollout(bind)
+    return FusedRollout(bind)
 
 
-@dataclasses.dataclass(frozen=True)
-class _FusedRollout:
-    """A RolloutFn; `bind` lays the weights out for the kernel, once for many calls."""
+def _origin(model: Any) -> tuple[EnsembleConfig, ModelSpace]:
+    """Returns what a model was built from."""
+    if not isinstance(model, Ensemble):
+        kind = type(model).__name__
+        raise TypeError(f"model must be an Ensemble of jaxpets.ensemble, got {kind}.")
+    if model.config is None or model.space is None:
+        raise ValueError(
+            "model must be built by jaxpets.ensemble: a kernel is made from its config "
+            f"and space, got {model.config!r} and {model.space!r}. For a model of your "
+            "own use particle_rollout."
+        )
+    return model.config, model.space
 
-    bind: Callable[[EnsembleParams], Callable[[Array, Array, Array], Array]]
 
-    def __call__(
-        self, params: EnsembleParams, key: Array, obs: Array, actions: Array
-    ) -> Array:
-        return self.bind(params)(key, obs, actions)
+def _layout(
+    model: Ensemble, config: EnsembleConfig, space: ModelSpace, kind: Kind
+) -> GpuLayout | CpuLayout:
+    """Returns how the model lies in memory.
+
+    Raises:
+      UnsupportedError: if there is no kernel of this kind for it, or for the device.
+    """
+    features = space.features(jnp.zeros((model.obs_size,), jnp.float32))
+    sizes = (model.obs_size, model.action_size, features.shape[-1], config.hidden_sizes)
+    if kind is Kind.CPU:
+        return CpuLayout(*sizes)
+    layout = GpuLayout(*sizes)
+    if config.precision is not Precision.BF16:
+        raise UnsupportedError(f"the precision is {config.precision.value}, not bf16")
+    if problem := layout.problem():
+        raise UnsupportedError(problem)
+    if kind is Kind.GPU:
+        _check_device(jax.devices()[0])
+    return layout
 
 
-def _target(
+def _model_header(
     config: EnsembleConfig,
     space: ModelSpace,
-    shape: KernelShape | TileShape,
+    layout: GpuLayout | CpuLayout,
     kind: Kind,
 ) -> str:
-    """Returns the FFI target of a kernel for this model, built if need be."""
-    rows = {name: shape.obs_size for name in ("obs", "target", "low", "high")}
+    """Returns the text of model.h: the sizes and the coordinates of this model."""
     is_free = config.state_margin is None
     functions = {
         "features": (space.features, ("obs",)),
@@ -145,15 +184,15 @@ def _target(
     }
     for name in ("next_obs", "bound"):
         function, arguments = functions[name]
-        _check_result(name, function, len(arguments), shape.obs_size)
+        _check_result(name, function, len(arguments), layout.obs_size)
     code = [
-        row_function(name, function, [(row, rows[row]) for row in arguments])
+        cpp_function(name, function, [(row, layout.obs_size) for row in arguments])
         for name, (function, arguments) in functions.items()
     ]
-    model = ['#pragma once\n#include "row.h"', shape.header(), *code]
-    if kind is Kind.GPU and isinstance(shape, KernelShape):
-        model.append(shape.products())
-    return load_kernel("\n".join(model), kind)
+    header = ['#pragma once\n#include "particle.h"', layout.header(), *code]
+    if kind is Kind.GPU and isinstance(layout, GpuLayout):
+        header.append(layout.products())
+    return "\n".join(header)
 
 
 def _free(obs: Array, low: Array, high: Array) -> Array:
@@ -171,12 +210,8 @@ def _check_result(
         raise UnsupportedError(f"{name} makes {list(shape)} of [{obs_size}]")
 
 
-def _check_shape(config: EnsembleConfig, shape: KernelShape) -> None:
-    """Checks what a GPU's kernel needs and a CPU's does not."""
-    if config.precision is not Precision.BF16:
-        raise UnsupportedError(f"the precision is {config.precision.value}, not bf16")
-    if problem := shape.problem():
-        raise UnsupportedError(problem)
+def _kind_for(device: Any) -> Kind:
+    return Kind.CPU if device.platform == "cpu" else Kind.GPU
 
 
 def _check_device(device: Any) -> None:

@@ -19,6 +19,7 @@ from jaxpets._src.checks import (
 from jaxpets._src.chunks import chunked
 from jaxpets._src.elites import WORST_VALUE
 from jaxpets._src.types import (
+    ModelRolloutFn,
     Planner,
     PlanOutput,
     PlanParams,
@@ -54,7 +55,8 @@ def plan(
     N or `chunk_size`, plus what reward_fn needs for n candidates at all H steps.
 
     Args:
-      rollout_fn: imagines; reads `PlanParams.dynamics`.
+      rollout_fn: imagines; reads `PlanParams.dynamics`. A ModelRolloutFn is bound to
+        them once per step.
       reward_fn: rewards one imagined step; reads `PlanParams.reward`.
       optimizer: searches; its state is the planner's state.
       chunk_size: at most so many candidates are imagined and rewarded at a time; None
@@ -131,8 +133,9 @@ def plan(
 
 def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], Array]:
     """Binds the model, before the loop of the search: XLA would not move it out."""
-    bind = getattr(rollout_fn, "bind", None)
-    return bind(params) if bind else functools.partial(rollout_fn, params)
+    if isinstance(rollout_fn, ModelRolloutFn):
+        return rollout_fn.bind(params)
+    return functools.partial(rollout_fn, params)
 
 
 def random_planner(action_low: ArrayLike, action_high: ArrayLike) -> Planner:

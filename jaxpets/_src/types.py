@@ -4,7 +4,7 @@ The letters of their shapes are explained in the docstring of `jaxpets`.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jax import Array
 
@@ -107,11 +107,7 @@ class DynamicsFn(Protocol):
 
 
 class RolloutFn(Protocol):
-    """An imagination: action sequences in, observation paths out.
-
-    It may have a method `bind(params)` that returns `(key, obs, actions) -> path`. Then
-    a planner binds once, before its search, what depends on nothing but the model.
-    """
+    """An imagination: action sequences in, observation paths out."""
 
     def __call__(self, params: Any, key: Array, obs: Any, actions: Array, /) -> Array:
         """Rolls N action sequences out from one start.
@@ -124,6 +120,24 @@ class RolloutFn(Protocol):
 
         Returns:
           `[N, H+1, E, P, D]` observations; index 0 along time is the start.
+        """
+        ...
+
+
+@runtime_checkable
+class ModelRolloutFn(RolloutFn, Protocol):
+    """A RolloutFn that prepares the model's parameters once for many calls.
+
+    A planner that gets one binds it before its search, so that what depends on nothing
+    but the parameters stays out of the loop. `rollout_fn(params, key, obs, actions)`
+    must equal `rollout_fn.bind(params)(key, obs, actions)`.
+    """
+
+    def bind(self, params: Any, /) -> Callable[[Array, Any, Array], Array]:
+        """Returns `(key, obs, actions) -> path`, as `__call__` has them.
+
+        Args:
+          params: anything the model needs.
         """
         ...
 

@@ -302,7 +302,7 @@ def test_where_no_kernel_runs_none_is_timed(monkeypatch):
 def test_on_a_cpu_the_kernel_is_timed_but_not_traced():
     size = workloads.named_size("tiny")
     rollout, args = workloads.rollout_work(size, "f32", "kernel")
-    assert hasattr(rollout, "bind")  # and is not the scan
+    assert rollout.uses_kernel
     want = jax.jit(workloads.rollout_fn(size, "f32"))(*args)
     np.testing.assert_allclose(jax.jit(rollout)(*args), want, rtol=1e-5, atol=1e-5)
     with pytest.raises(SystemExit, match="that of a CPU is --precision f32 only"):

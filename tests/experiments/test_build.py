@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -43,23 +45,17 @@ def test_a_search_is_unrolled_beside_a_kernel_of_a_gpu_only(
     """Where fused_rollout gives the scan instead, the search stays a loop."""
     searches = []
 
-    class Kernel:
-        def bind(self, params):
-            raise AssertionError("nothing is imagined here")
-
     def cem(*, unroll, **size):
         searches.append(unroll)
         return search(**size)
 
-    search, scan = jaxpets.optimizers.cem, jaxpets.particle_rollout
-    kernel = scan(lambda *_: None, num_members=3, num_particles=3)
-    kernel = kernel if fallback else Kernel()
+    search, fused = jaxpets.optimizers.cem, SimpleNamespace(uses_kernel=not fallback)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(jaxpets, "fused_rollout", lambda *_, **__: kernel)
+    monkeypatch.setattr(jaxpets, "fused_rollout", lambda *_, **__: fused)
     monkeypatch.setattr(jaxpets.optimizers, "cem", cem)
-    precision, fused = flags
+    precision, flag = flags
     phase = ["--phase", "explore", "--preset", "smoke", "--allow-cpu"]
-    build(cli.parse([*phase, "--planner.precision", precision, fused]))
+    build(cli.parse([*phase, "--planner.precision", precision, flag]))
     assert searches[0] is (wanted and not fallback)
 
 
@@ -79,11 +75,10 @@ def test_a_kernel_is_asked_for_where_there_may_be_one(
 ):
     """Elsewhere it would warn that there is none."""
     asked = []
-    scan = jaxpets.particle_rollout(lambda *_: None, num_members=3, num_particles=3)
 
-    def fused(config, *_, **__):
-        asked.append(config.precision)
-        return scan
+    def fused(model, **_):
+        asked.append(model.config.precision)
+        return SimpleNamespace(uses_kernel=False)
 
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(jaxpets, "fused_rollout", fused)

@@ -11,6 +11,8 @@ import pytest
 
 import jaxpets
 from jaxpets import Precision
+from jaxpets._src.fused_rollout import rollout_of_kind
+from jaxpets._src.kernel.build import Kind
 from jaxpets.envs import half_cheetah as hc
 
 
@@ -65,11 +67,13 @@ class Case:
             state_margin=self.state_margin,
         )
 
-    def sizes(self):
-        return dict(obs_size=self.obs_size, action_size=self.action_size)
-
     def model(self, precision=Precision.F32):
-        return jaxpets.ensemble(self.config(precision), self.space, **self.sizes())
+        return jaxpets.ensemble(
+            self.config(precision),
+            self.space,
+            obs_size=self.obs_size,
+            action_size=self.action_size,
+        )
 
     def scan(self, precision=Precision.F32):
         return jaxpets.particle_rollout(
@@ -78,14 +82,16 @@ class Case:
             num_particles=self.num_members * self.particles,
         )
 
-    def fused(self, precision=Precision.BF16, *, interpret):
+    def fused(self, precision=Precision.BF16):
+        """With the kernel of the first device, as a user has it."""
         return jaxpets.fused_rollout(
-            self.config(precision),
-            self.space,
-            num_particles=self.num_members * self.particles,
-            interpret=interpret,
-            **self.sizes(),
+            self.model(precision), num_particles=self.num_members * self.particles
         )
+
+    def of_kind(self, kind, precision=Precision.BF16):
+        """With this kind of kernel."""
+        num_particles = self.num_members * self.particles
+        return rollout_of_kind(self.model(precision), num_particles, kind)
 
     @functools.cache  # noqa: B019
     def args(self):
@@ -144,20 +150,18 @@ class Engine:
     """A way to compute the kernel's rollout on this machine.
 
     Attributes:
-      name: of it.
+      kind: of kernel.
       rounding: the most relative error, against the scan in float32.
-      interpret: as `fused_rollout` has it.
     """
 
-    name: str
+    kind: Kind
     rounding: float
-    interpret: bool
 
     @functools.cache  # noqa: B019
     def fused(self, case):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # it is the kernel
-            return case.fused(interpret=self.interpret)
+        fused = case.of_kind(self.kind)
+        assert fused.uses_kernel, fused.reason
+        return fused
 
     @functools.cache  # noqa: B019
     def run(self, case):
@@ -167,10 +171,10 @@ class Engine:
 # The GPU's kernel multiplies float16 numbers, the scan float32 ones: every layer
 # rounds its inputs and weights by up to 2^-12 of themselves. Errors of many terms
 # cancel; those of H steps add up, but so do the moves they are compared with.
-REFERENCE = Engine("reference", 2e-4, interpret=True)
+REFERENCE = Engine(Kind.GPU_REFERENCE, 2e-4)
 # The CPU's kernel differs from the scan by the order of its sums, and by functions that
 # are right to two units in the last place, 1e-7: measured 5e-8 to 2e-7 in all.
-CPU = Engine("cpu", 1e-6, interpret=False)
+CPU = Engine(Kind.CPU, 1e-6)
 needs_cpu = pytest.mark.skipif(
     jax.devices()[0].platform != "cpu", reason="the kernel is that of the first device"
 )

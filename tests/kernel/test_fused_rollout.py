@@ -11,7 +11,6 @@ import toys
 from rollouts import (
     CASES,
     CHEETAH,
-    ENGINES,
     FORGETFUL,
     LETTERS,
     SIZES,
@@ -24,12 +23,8 @@ from rollouts import (
 import jaxpets
 from jaxpets import Precision
 from jaxpets._src.chunks import window
+from jaxpets._src.types import ModelRolloutFn
 from jaxpets.envs import half_cheetah as hc
-
-
-@pytest.fixture(params=ENGINES)
-def engine(request):
-    return request.param
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -106,10 +101,11 @@ def test_keys_decide(engine):
     assert np.mean(path[:, 1:] != other[:, 1:]) > 0.9  # the rest is at its bound
 
 
-def test_a_key_of_the_old_kind_is_the_same_key(engine):
+def test_a_key_of_the_old_kind_is_refused(engine):
     params, key, obs, actions = SMALL.args()
-    old = engine.run(SMALL)(params, jax.random.key_data(key), obs, actions)
-    np.testing.assert_array_equal(old, engine.run(SMALL)(params, key, obs, actions))
+    old = jax.random.key_data(key)
+    with pytest.raises(TypeError, match=r"key must be a typed key from jax.random.key"):
+        engine.run(SMALL)(params, old, obs, actions)
 
 
 @pytest.mark.parametrize(("first", "count"), [(0, 4), (1, 2), (3, 1)])
@@ -224,6 +220,15 @@ def test_one_trace_for_all_values(engine):
     assert len(traces) == 1
 
 
+def test_a_planner_may_bind_it(engine):
+    """The call is what the bound one is, to the last bit."""
+    params, *rest = SMALL.args()
+    fused = engine.fused(SMALL)
+    assert isinstance(fused, ModelRolloutFn) and not isinstance(scan, ModelRolloutFn)
+    got = jax.jit(lambda params, *rest: fused.bind(params)(*rest))(params, *rest)
+    np.testing.assert_array_equal(got, engine.run(SMALL)(params, *rest))
+
+
 def step_of(rollout, chunk_size=None, name="cem"):
     search = toys.optimizer(name, horizon=3, size=SMALL.action_size)
     planner = jaxpets.plan(rollout, toys.reach, search, chunk_size=chunk_size)
@@ -333,9 +338,17 @@ def test_wrong_shapes_are_refused(engine):
     with pytest.raises(ValueError, match=text):
         jax.eval_shape(engine.fused(SMALL), params, key, obs, actions[..., :1])
     with pytest.raises(ValueError, match="num_particles must be a multiple"):
-        jaxpets.fused_rollout(
-            SMALL.config(), SMALL.space, num_particles=4, **SMALL.sizes()
-        )
+        jaxpets.fused_rollout(SMALL.model(), num_particles=4)
+
+
+def test_a_model_that_is_not_of_jaxpets_is_refused():
+    """A kernel is made from config and space, which functions alone do not tell."""
+    own = SMALL.model()._replace(config=None, space=None)
+    with pytest.raises(ValueError, match="model must be built by jaxpets"):
+        jaxpets.fused_rollout(own, num_particles=6)
+    text = "model must be an Ensemble of jaxpets.ensemble, got EnsembleConfig"
+    with pytest.raises(TypeError, match=text):
+        jaxpets.fused_rollout(SMALL.config(), num_particles=6)
 
 
 def test_it_has_no_gradient(engine):

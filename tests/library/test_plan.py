@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -181,6 +183,26 @@ def test_start_reaches_the_rollout_untouched(key):
     plain = jaxpets.plan(CART, toys.reach, toys.optimizer("cem"))
     want, _ = plain.step(PARAMS, key, plain.init(), jnp.zeros(2))
     toys.assert_trees_close(got, want, rtol=0)
+
+
+@pytest.mark.parametrize("name", toys.OPTIMIZERS)
+def test_a_rollout_that_binds_is_bound_once_and_plans_the_same(name, key):
+    bound = []
+
+    class Binding:
+        def __call__(self, params, key, obs, actions):
+            raise AssertionError("it has a bind")
+
+        def bind(self, params):
+            bound.append(params)
+            return functools.partial(ROLLOUT, params)
+
+    def planned(rollout):
+        planner = jaxpets.plan(rollout, toys.reach, toys.optimizer(name))
+        return jax.jit(planner.step)(PARAMS, key, planner.init(), jnp.zeros(2))
+
+    toys.assert_trees_close(planned(Binding()), planned(ROLLOUT), rtol=0)
+    assert len(bound) == 1
 
 
 def test_controls_a_cart(key):

@@ -16,19 +16,15 @@ from pathlib import Path
 
 import jax
 
-_SOURCES = (
-    "row.h", "sizes.h", "halves.h", "tiles.h", "rollout.h", "handler.h", "wgmma.h",
-    "rollout.cu", "rollout.cc", "reference.cc",
-)  # fmt: skip
 _SYMBOL = "jaxpets_rollout"
 
 
 class Kind(enum.Enum):
     """What is built: the source file of each."""
 
-    GPU = "rollout.cu"
-    CPU = "rollout.cc"
-    REFERENCE = "reference.cc"  # the arithmetic of the GPU's, on a CPU
+    GPU = "gpu_rollout.cu"
+    GPU_REFERENCE = "gpu_reference.cc"  # the GPU's arithmetic, on a CPU
+    CPU = "cpu_rollout.cc"
 
 
 class BuildError(Exception):
@@ -53,9 +49,7 @@ def load_kernel(model: str, kind: Kind) -> str:
     if kind is Kind.CPU:
         # A folder that machines share has a library for every kind of processor.
         recipe.append(_processor(compiler))
-    folder = importlib.resources.files("jaxpets._src.kernel")
-    sources = {name: (folder / name).read_text() for name in _SOURCES}
-    sources["model.h"] = model
+    sources = {**_shipped_sources(), "model.h": model}
     digest = hashlib.sha256("\0".join([*recipe, *sources.values()]).encode())
     target = f"{_SYMBOL}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
     library = _cache_folder() / f"{target}.so"
@@ -71,6 +65,17 @@ def load_kernel(model: str, kind: Kind) -> str:
     where = "CUDA" if kind is Kind.GPU else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
     return target
+
+
+def _shipped_sources() -> dict[str, str]:
+    """Returns the C++ and CUDA files beside this one, by name."""
+    files = importlib.resources.files("jaxpets._src.kernel").iterdir()
+    texts = {
+        file.name: file.read_text()
+        for file in files
+        if file.name.endswith((".h", ".cc", ".cu"))
+    }
+    return dict(sorted(texts.items()))
 
 
 def _compile(
@@ -118,7 +123,7 @@ def _compiler(kind: Kind) -> list[str]:
     """Returns the command that builds a library, without the files."""
     if kind is Kind.GPU:
         return _nvcc()
-    if kind is Kind.REFERENCE:
+    if kind is Kind.GPU_REFERENCE:
         return _host_compiler()
     is_x86 = platform.machine().lower() in ("x86_64", "amd64")
     flags = ["-O3", "-march=native" if is_x86 else "-mcpu=native"]

@@ -1,5 +1,5 @@
 // The rollout's operands, and how they lie in memory, for GPU and CPU. The layout of the
-// weights, halves.h or tiles.h, is included before.
+// weights, gpu_layout.h or cpu_layout.h, is included before.
 #pragma once
 
 #include <cstddef>
@@ -41,11 +41,11 @@ struct Rollout {
 };
 
 // How far the steps of a particle's path lie apart.
-ROW_FUNCTION int64_t path_stride(const Rollout& rollout) {
+PARTICLE_FUNCTION int64_t path_stride(const Rollout& rollout) {
   return int64_t(rollout.num_members) * rollout.particles * OBS;
 }
 
-ROW_FUNCTION Rollout at_batch(Rollout rollout, int64_t index) {
+PARTICLE_FUNCTION Rollout at_batch(Rollout rollout, int64_t index) {
   rollout.path +=
       index * rollout.num_candidates * (rollout.horizon + 1) * path_stride(rollout);
   for (int axis = MAX_BATCH_AXES - 1; axis >= 0; --axis) {
@@ -62,8 +62,8 @@ ROW_FUNCTION Rollout at_batch(Rollout rollout, int64_t index) {
 }
 
 // Moves one particle: reads its observation and target, overwrites the observation.
-ROW_FUNCTION void move(float (&obs)[OBS], const float (&target)[OBS],
-                       const float* shared) {
+PARTICLE_FUNCTION void move(float (&obs)[OBS], const float (&target)[OBS],
+                            const float* shared) {
   float moved[OBS], low[OBS], high[OBS];
   UNROLLED
   for (int i = 0; i < OBS; ++i) low[i] = shared[LOW + i], high[i] = shared[HIGH + i];
@@ -71,19 +71,19 @@ ROW_FUNCTION void move(float (&obs)[OBS], const float (&target)[OBS],
   bound(moved, low, high, obs);
 }
 
-ROW_FUNCTION float scaled(float input, int index, const float* shared) {
+PARTICLE_FUNCTION float scaled(float input, int index, const float* shared) {
   return (input - shared[INPUT_MEAN + index]) * shared[INPUT_SCALE + index];
 }
 
 // Where a particle's path begins.
-ROW_FUNCTION float* path_of(const Rollout& rollout, int member, int particle) {
+PARTICLE_FUNCTION float* path_of(const Rollout& rollout, int member, int particle) {
   const int candidate = particle / rollout.particles;
   return rollout.path + candidate * (rollout.horizon + 1) * path_stride(rollout) +
          (member * rollout.particles + particle % rollout.particles) * OBS;
 }
 
 // The place of a particle's first entry in the draw of `[E, N, P, OBS]`.
-ROW_FUNCTION uint32_t noise_counter(const Rollout& rollout, const uint32_t* key,
-                                    int member, int particle) {
+PARTICLE_FUNCTION uint32_t noise_counter(const Rollout& rollout, const uint32_t* key,
+                                         int member, int particle) {
   return ((member * key[3] + key[2]) * rollout.particles + particle) * OBS;
 }

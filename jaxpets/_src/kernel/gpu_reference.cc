@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "halves.h"
+#include "gpu_layout.h"
 // The layout comes first.
 #include "handler.h"
 

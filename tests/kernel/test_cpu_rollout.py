@@ -14,6 +14,7 @@ import pytest
 from rollouts import CPU, SMALL, Case, needs_cpu, recorded, relative_error, scan
 
 from jaxpets import Precision
+from jaxpets._src.kernel.build import Kind
 
 pytestmark = needs_cpu
 
@@ -41,8 +42,8 @@ def test_observations_and_actions_may_be_wide():
 
 @pytest.mark.parametrize("precision", Precision)
 def test_every_precision_is_float32(precision):
-    fused, caught = recorded(lambda: SMALL.fused(precision, interpret=False))
-    assert not caught
+    fused, caught = recorded(lambda: SMALL.fused(precision))
+    assert not caught and fused.uses_kernel and fused.reason == ""
     got = jax.jit(fused)(*SMALL.args())
     np.testing.assert_array_equal(got, CPU.run(SMALL)(*SMALL.args()))
 
@@ -105,9 +106,7 @@ def test_processors_that_cannot_multiply_and_add_at_once_have_none(
 ):
     without("fma", monkeypatch, tmp_path)
     case = dataclasses.replace(SMALL, hidden_sizes=(16, 26))
-    text = "fused_rollout runs as a scan: the processor has no fused multiply-add"
-    with pytest.warns(UserWarning, match=text):
-        case.fused(interpret=False)
+    assert case.of_kind(Kind.CPU).reason == "the processor has no fused multiply-add"
 
 
 @pytest.mark.parametrize("num_members", [1, 2, 17])

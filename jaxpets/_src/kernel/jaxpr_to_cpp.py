@@ -1,4 +1,4 @@
-"""A function of one row of numbers, written as JAX, written out as C++.
+"""A function of one particle's numbers, written as JAX, written out as C++.
 
 A rollout kernel steps particles one by one: on a GPU one per thread, on a CPU one per
 lane of a vector. The coordinates of a model, its ModelSpace, are JAX functions; this
@@ -87,7 +87,7 @@ class UnsupportedError(Exception):
     """A primitive that has no C++ here."""
 
 
-def row_function(
+def cpp_function(
     name: str, function: Callable[..., Any], sizes: Sequence[tuple[str, int]]
 ) -> str:
     """Returns C++ for a function of float32 vectors that returns one vector.
@@ -105,20 +105,20 @@ def row_function(
     shapes = [jax.ShapeDtypeStruct((size,), jnp.float32) for _, size in sizes]
     closed = jax.make_jaxpr(function)(*shapes)
     writer = _Writer()
-    rows = [
+    names = [
         np.array([f"{argument}[{i}]" for i in range(size)], dtype=object)
         for argument, size in sizes
     ]
-    (result,) = writer.run(closed.jaxpr, closed.consts, rows)
+    (result,) = writer.run(closed.jaxpr, closed.consts, names)
     stores = [
         f"out[{i}] = {_text(value)};" for i, value in enumerate(result.reshape(-1))
     ]
-    types = [f"class Row{i}" for i in range(len(sizes))]
-    arguments = [f"const Row{i}& {name}" for i, (name, _) in enumerate(sizes)]
+    types = [f"class In{i}" for i in range(len(sizes))]
+    arguments = [f"const In{i}& {name}" for i, (name, _) in enumerate(sizes)]
     body = "\n  ".join([*writer.lines, *stores])
     return (
         f"template <{', '.join(types)}, class Out>\n"
-        f"ROW_FUNCTION void {name}({', '.join(arguments)}, Out&& out) {{\n"
+        f"PARTICLE_FUNCTION void {name}({', '.join(arguments)}, Out&& out) {{\n"
         f"  {body}\n}}\n"
     )
 
@@ -129,7 +129,9 @@ class _Writer:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def run(self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list:
+    def run(
+        self, jaxpr: Any, consts: Sequence[Any], args: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
         known: dict[Any, np.ndarray] = {}
 
         def read(atom: Any) -> np.ndarray:
@@ -174,7 +176,9 @@ class _Writer:
         self.lines.append(f"const {kind} {name} = {expression};")
         return name
 
-    def _elementwise(self, name: str, aval: Any, inputs: list) -> np.ndarray:
+    def _elementwise(
+        self, name: str, aval: Any, inputs: list[np.ndarray]
+    ) -> np.ndarray:
         kind = _kind(aval.dtype)
         result = np.empty(aval.shape, dtype=object)
         operands = [np.broadcast_to(array, aval.shape) for array in inputs]
@@ -219,7 +223,7 @@ class _Writer:
 def _bind(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Runs a primitive on numbers, now."""
     with jax.ensure_compile_time_eval():
-        results = eqn.primitive.bind(*map(jnp.asarray, inputs), **eqn.params)
+        results = eqn.primitive.bind(*[jnp.asarray(x) for x in inputs], **eqn.params)
     results = results if eqn.primitive.multiple_results else [results]
     return [np.asarray(result) for result in results]
 
@@ -227,7 +231,7 @@ def _bind(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
 def _move(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """Runs a primitive on the positions of elements and looks the elements up."""
     pool: list[Any] = []
-    places = []
+    places: list[np.ndarray] = []
     for array, atom in zip(inputs, eqn.invars, strict=True):
         if jnp.issubdtype(atom.aval.dtype, jnp.integer):
             places.append(array)  # where to read, not what
@@ -241,7 +245,7 @@ def _move(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
         params["fill_value"] = len(pool)
         pool.append(math.nan if fill is None else fill)
     with jax.ensure_compile_time_eval():
-        results = eqn.primitive.bind(*map(jnp.asarray, places), **params)
+        results = eqn.primitive.bind(*[jnp.asarray(x) for x in places], **params)
     results = results if eqn.primitive.multiple_results else [results]
     values = np.empty(len(pool), dtype=object)
     values[:] = pool

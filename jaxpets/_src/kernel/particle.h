@@ -7,36 +7,36 @@
 #include <cstring>
 
 #ifdef __CUDACC__
-#define ROW_FUNCTION __host__ __device__ __forceinline__
+#define PARTICLE_FUNCTION __host__ __device__ __forceinline__
 #define UNROLLED _Pragma("unroll")
 #else
 // Static: libraries of other models have functions of these names too.
-#define ROW_FUNCTION static inline
+#define PARTICLE_FUNCTION static inline
 #define UNROLLED
 #endif
 
 // Like jnp.maximum and jnp.minimum, and unlike fmaxf, these keep a NaN.
-ROW_FUNCTION float higher(float a, float b) { return a > b || a != a ? a : b; }
-ROW_FUNCTION float lower(float a, float b) { return a < b || a != a ? a : b; }
+PARTICLE_FUNCTION float higher(float a, float b) { return a > b || a != a ? a : b; }
+PARTICLE_FUNCTION float lower(float a, float b) { return a < b || a != a ? a : b; }
 
 // On the GPU these are instructions of about 22 bits, not calls.
 #ifdef __CUDA_ARCH__
-ROW_FUNCTION float fast_exp(float x) {
+PARTICLE_FUNCTION float fast_exp(float x) {
   float y;
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * 1.44269504f));
   return y;
 }
-ROW_FUNCTION float fast_log(float x) {
+PARTICLE_FUNCTION float fast_log(float x) {
   float y;
   asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y * 0.693147181f;
 }
-ROW_FUNCTION float fast_inverse(float x) {
+PARTICLE_FUNCTION float fast_inverse(float x) {
   float y;
   asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
 }
-ROW_FUNCTION float fast_sqrt(float x) {
+PARTICLE_FUNCTION float fast_sqrt(float x) {
   float y;
   asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
@@ -45,12 +45,12 @@ ROW_FUNCTION float fast_sqrt(float x) {
 // On the CPU they have no branches and call no library, so that a loop over particles
 // becomes vector instructions. Exponential and logarithm are right to one or two units
 // in the last place; the former is infinite above 88 and 0 below -87.
-ROW_FUNCTION int32_t bits_of(float number) {
+PARTICLE_FUNCTION int32_t bits_of(float number) {
   int32_t bits;
   memcpy(&bits, &number, sizeof bits);
   return bits;
 }
-ROW_FUNCTION float number_of(int32_t bits) {
+PARTICLE_FUNCTION float number_of(int32_t bits) {
   float number;
   memcpy(&number, &bits, sizeof number);
   return number;
@@ -58,7 +58,7 @@ ROW_FUNCTION float number_of(int32_t bits) {
 // A sum with it has no digits left for fractions, and its last bits are a whole number.
 constexpr float ROUNDER = 12582912.0f;
 // 2^(shifted - ROUNDER + rest), for a rest within one half; normal or 2^128, infinite.
-ROW_FUNCTION float power_of_two(float shifted, float rest) {
+PARTICLE_FUNCTION float power_of_two(float shifted, float rest) {
   float p = 0.000152509994f;
   p = fmaf(p, rest, 0.00133905141f);
   p = fmaf(p, rest, 0.00961879175f);
@@ -69,7 +69,7 @@ ROW_FUNCTION float power_of_two(float shifted, float rest) {
   const uint32_t exponent = uint32_t(bits_of(shifted)) << 23;
   return number_of(int32_t(uint32_t(bits_of(p)) + exponent));
 }
-ROW_FUNCTION float fast_exp(float x) {
+PARTICLE_FUNCTION float fast_exp(float x) {
   const float shifted = fmaf(x, 1.44269502f, ROUNDER);
   float rest = fmaf(x, 1.44269502f, ROUNDER - shifted);
   rest = fmaf(x, 1.92596303e-08f, rest);
@@ -77,7 +77,7 @@ ROW_FUNCTION float fast_exp(float x) {
   return x != x ? x : x > 88.0f ? HUGE_VALF : x < -87.0f ? 0.0f : y;
 }
 // Of normal numbers above 0.
-ROW_FUNCTION float fast_log(float x) {
+PARTICLE_FUNCTION float fast_log(float x) {
   const int32_t root_half = 0x3F3504F3;
   const int32_t twos = (bits_of(x) - root_half) >> 23;
   const float t = number_of(bits_of(x) - twos * (1 << 23)) - 1.0f;
@@ -92,13 +92,13 @@ ROW_FUNCTION float fast_log(float x) {
   p = fmaf(p * t - 0.5f, t * t, t);
   return fmaf(float(twos), 0.693147181f, p);
 }
-ROW_FUNCTION float fast_inverse(float x) { return 1.0f / x; }
-ROW_FUNCTION float fast_sqrt(float x) { return sqrtf(x); }
+PARTICLE_FUNCTION float fast_inverse(float x) { return 1.0f / x; }
+PARTICLE_FUNCTION float fast_sqrt(float x) { return sqrtf(x); }
 #endif
 
 // An angle without its full turns; 2 pi is cut in three so that little is lost up to
 // a million radians.
-ROW_FUNCTION float within_turn(float angle) {
+PARTICLE_FUNCTION float within_turn(float angle) {
   const float turns = rintf(angle * 0.15915494f);
   angle = fmaf(turns, -6.28125f, angle);
   angle = fmaf(turns, -0.00193500518798828125f, angle);
@@ -106,12 +106,12 @@ ROW_FUNCTION float within_turn(float angle) {
 }
 
 #ifdef __CUDA_ARCH__
-ROW_FUNCTION float sine(float angle) { return __sinf(within_turn(angle)); }
-ROW_FUNCTION float cosine(float angle) { return __cosf(within_turn(angle)); }
+PARTICLE_FUNCTION float sine(float angle) { return __sinf(within_turn(angle)); }
+PARTICLE_FUNCTION float cosine(float angle) { return __cosf(within_turn(angle)); }
 #else
 // Of angles within a quarter turn. Those of a hundred million radians are not, after
 // their turns were rounded; they get a number that is some sine.
-ROW_FUNCTION float near_sine(float angle) {
+PARTICLE_FUNCTION float near_sine(float angle) {
   const float square = angle * angle;
   float p = 2.60668139e-06f;
   p = fmaf(p, square, -0.00019810081f);
@@ -119,25 +119,25 @@ ROW_FUNCTION float near_sine(float angle) {
   p = fmaf(p, square, -0.166666597f);
   return lower(higher(fmaf(p * square, angle, angle), -1.0f), 1.0f);
 }
-ROW_FUNCTION float sine(float angle) {
+PARTICLE_FUNCTION float sine(float angle) {
   angle = within_turn(angle);
   const bool is_near = fabsf(angle) <= 1.57079633f;
   return near_sine(is_near ? angle : copysignf(3.14159265f, angle) - angle);
 }
-ROW_FUNCTION float cosine(float angle) {
+PARTICLE_FUNCTION float cosine(float angle) {
   return near_sine(1.57079633f - fabsf(within_turn(angle)));
 }
 #endif
 
-ROW_FUNCTION uint32_t rotated(uint32_t x, int distance) {
+PARTICLE_FUNCTION uint32_t rotated(uint32_t x, int distance) {
   return (x << distance) | (x >> (32 - distance));
 }
 
 // 32 random bits each: elements `first + i * stride` of a draw of at most 2^32 with jax's
 // threefry2x32. All advance together: a single one would wait for itself at every step.
 template <int COUNT>
-ROW_FUNCTION void threefry(uint32_t key0, uint32_t key1, uint32_t first, uint32_t stride,
-                           uint32_t (&bits)[COUNT]) {
+PARTICLE_FUNCTION void threefry(uint32_t key0, uint32_t key1, uint32_t first,
+                                uint32_t stride, uint32_t (&bits)[COUNT]) {
   const uint32_t keys[3] = {key0, key1, key0 ^ key1 ^ 0x1BD11BDAu};
   uint32_t x[COUNT], y[COUNT];
   UNROLLED
@@ -169,7 +169,7 @@ ROW_FUNCTION void threefry(uint32_t key0, uint32_t key1, uint32_t first, uint32_
 // What jax.random.normal makes of 32 bits: sqrt(2) erfinv(u), u uniform in (-1, 1), by
 // M. Giles, "Approximating the erfinv function", single precision.
 template <int COUNT>
-ROW_FUNCTION void normal(const uint32_t (&bits)[COUNT], float (&drawn)[COUNT]) {
+PARTICLE_FUNCTION void normal(const uint32_t (&bits)[COUNT], float (&drawn)[COUNT]) {
   float u[COUNT], w[COUNT];
   int num_tails = 0;
   UNROLLED
@@ -212,6 +212,6 @@ ROW_FUNCTION void normal(const uint32_t (&bits)[COUNT], float (&drawn)[COUNT]) {
 // The standard deviation behind a raw log-variance, bounded softly from both sides:
 // lv = max - softplus(max - raw), lv = min + softplus(lv - min), exp(lv / 2). In terms of
 // variances that is exp(lv) = exp(min) + 1 / (exp(-max) + exp(-raw)).
-ROW_FUNCTION float deviation(float raw, float min_variance, float max_precision) {
+PARTICLE_FUNCTION float deviation(float raw, float min_variance, float max_precision) {
   return fast_sqrt(min_variance + fast_inverse(max_precision + fast_exp(-raw)));
 }

@@ -14,7 +14,7 @@
 
 #include <cuda_fp16.h>
 
-#include "halves.h"
+#include "gpu_layout.h"
 // The layout comes first.
 #include "handler.h"
 #include "wgmma.h"

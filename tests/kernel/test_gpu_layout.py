@@ -1,44 +1,31 @@
 """The kernel's sizes fit the GPU, and parameters lie where it reads them."""
 
 import dataclasses
-import itertools
 import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from layers import layers_of
 
-from jaxpets._src.kernel.shape import SHARED_MEMORY, KernelShape
+from jaxpets._src.kernel.gpu_layout import SHARED_MEMORY, GpuLayout
 
-SMALL = KernelShape(obs_size=5, action_size=2, feature_size=7, hidden_sizes=(20, 33))
-PAPER = KernelShape(18, 6, 18, (200, 200, 200, 200))
-SHAPES = {
+SMALL = GpuLayout(obs_size=5, action_size=2, feature_size=7, hidden_sizes=(20, 33))
+PAPER = GpuLayout(18, 6, 18, (200, 200, 200, 200))
+LAYOUTS = {
     "small": SMALL,
-    "one layer": KernelShape(1, 1, 1, (1,)),
+    "one layer": GpuLayout(1, 1, 1, (1,)),
     "paper": PAPER,
-    "narrow first": KernelShape(3, 2, 4, (8, 64, 24)),
-    "full chunks": KernelShape(8, 6, 8, (30, 30)),  # 14 inputs and two biases
+    "narrow first": GpuLayout(3, 2, 4, (8, 64, 24)),
+    "full chunks": GpuLayout(8, 6, 8, (30, 30)),  # 14 inputs and two biases
 }
-
-
-def layers_of(shape, members=2, seed=0):
-    """Parameters `[E, in, out]` and `[E, out]` of each layer."""
-    rng = np.random.default_rng(seed)
-    sizes = [shape.input_size, *shape.hidden_sizes, 2 * shape.obs_size]
-    return [
-        {
-            "kernel": rng.normal(size=(members, a, b)).astype(np.float32),
-            "bias": rng.normal(size=(members, b)).astype(np.float32),
-        }
-        for a, b in itertools.pairwise(sizes)
-    ]
 
 
 def unpacked(numbers, rows, columns):
     """Reads a matrix `[E, chunks * 16, columns]` from the front; returns the rest.
 
-    By what rollout.h says: chunks of 16 rows follow one another; in a chunk, blocks of
+    As gpu_layout.h says: chunks of 16 rows follow one another; in a chunk, blocks of
     8 x 8 lie 8 columns after 8 columns, for each the upper rows first; in a block,
     column after column.
     """
@@ -49,24 +36,21 @@ def unpacked(numbers, rows, columns):
     return numbers[:, place], numbers[:, chunks * 16 * columns :]
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", LAYOUTS)
 def test_parameters_lie_as_documented(name):
-    shape, layers = SHAPES[name], layers_of(SHAPES[name])
-    packed = jax.jit(shape.pack)(layers)
+    layout, layers = LAYOUTS[name], layers_of(LAYOUTS[name])
+    packed = jax.jit(layout.pack)(layers)
     assert packed.dtype == jnp.float16
     rest = np.float64(packed)
-    width = max(24, -(-max(shape.hidden_sizes) // 8) * 8)
-    left = -(-(-(-width // 16) * 16 // 2) // 16) * 16
-    head = -(-shape.obs_size // 8) * 8
-    assert (shape.width, shape.left, shape.head) == (width, left, head)
-    assert 0 < width - left <= left and (width - left) % 8 == 0
-    rows = [shape.input_size] + [width] * len(shape.hidden_sizes)
+    width, left, head = layout.width, layout.left, layout.head
+    assert 0 < width - left <= left
+    rows = [layout.input_size] + [width] * len(layout.hidden_sizes)
     for i, (layer, size) in enumerate(zip(layers, rows, strict=True)):
         kernel, bias = (np.float64(layer[name]) for name in ("kernel", "bias"))
         is_head = i == len(layers) - 1
         if is_head:
             found, rest = unpacked(rest, size, 2 * head)
-            entries = np.arange(shape.obs_size)
+            entries = np.arange(layout.obs_size)
             columns = np.concatenate([entries, head + entries])
         else:
             halves = []
@@ -86,6 +70,19 @@ def test_parameters_lie_as_documented(name):
         found[:, :inner, columns] = found[:, size : size + 2, columns] = 0
         assert not found.any()
     assert rest.shape == (2, 0)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_the_sources_have_the_same_sizes(assert_constants, name):
+    layout = LAYOUTS[name]
+    packed = jax.eval_shape(layout.pack, layers_of(layout))
+    sizes = {
+        "LEFT": layout.left,
+        "RIGHT": layout.width - layout.left,
+        "HEAD": layout.head,
+        "MEMBER_WEIGHTS": packed.shape[1],
+    }
+    assert_constants("gpu_layout.h", layout.header(), sizes)
 
 
 def test_what_float16_cannot_hold_is_as_large_as_can_be():
@@ -109,18 +106,18 @@ def test_members_do_not_mix():
         np.testing.assert_array_equal(packed[e], one[0])
 
 
-def bytes_of(shape, streaming):
-    """Shared memory as rollout.cu declares it."""
-    inputs = -(-(shape.input_size + 2) // 16)
-    hidden = -(-(shape.width + 2) // 16)
-    right = shape.width - shape.left
-    numbers = inputs * 16 * shape.width + hidden * 16 * 2 * shape.head
-    for _ in shape.hidden_sizes[1:]:
-        numbers += (hidden - streaming.left) * 16 * shape.left
+def bytes_of(layout, streaming):
+    """Shared memory as gpu_rollout.cu declares it."""
+    inputs = -(-(layout.input_size + 2) // 16)
+    hidden = -(-(layout.width + 2) // 16)
+    right = layout.width - layout.left
+    numbers = inputs * 16 * layout.width + hidden * 16 * 2 * layout.head
+    for _ in layout.hidden_sizes[1:]:
+        numbers += (hidden - streaming.left) * 16 * layout.left
         numbers += (hidden - streaming.right) * 16 * right
-    numbers += streaming.slots * streaming.unit * 16 * shape.left
-    words = -(-shape.obs_size // 4)
-    shared = 2 * 4 * -(-shape.input_size // 4) + 4 * 4 * words
+    numbers += streaming.slots * streaming.unit * 16 * layout.left
+    words = -(-layout.obs_size // 4)
+    shared = 2 * 4 * -(-layout.input_size // 4) + 4 * 4 * words
     stride = 4 * (words if words % 2 else words + 1)
     tiles = 2 * (2 * 64 * stride) + 2 * (64 * 2)  # of state and target, and offsets
     inputs_tile = 2 * 64 * (inputs * 16 + 8)
@@ -134,22 +131,22 @@ def test_every_model_that_is_accepted_fits_into_shared_memory():
     for width in (1, 24, 25, 32, 64, 100, 128, 200, 240, 256):
         for depth in (1, 2, 4, 8):
             for obs_size, inputs in ((1, 1), (8, 4), (18, 6), (47, 30), (128, 128)):
-                shape = KernelShape(obs_size, inputs, obs_size, (width,) * depth)
-                streaming = shape.streaming()
+                layout = GpuLayout(obs_size, inputs, obs_size, (width,) * depth)
+                streaming = layout.streaming()
                 if streaming is None:
-                    assert shape.problem() is not None
+                    assert layout.problem() is not None
                     continue
-                assert shape.problem() is None
+                assert layout.problem() is None
                 fitting.append((width, depth, obs_size))
-                hidden = -(-(shape.width + 2) // 16)
-                assert bytes_of(shape, streaming) <= SHARED_MEMORY
+                hidden = -(-(layout.width + 2) // 16)
+                assert bytes_of(layout, streaming) <= SHARED_MEMORY
                 for part in (streaming.left, streaming.right):
                     assert 0 <= part <= hidden and part % streaming.unit == 0
                 assert 0 < streaming.unit <= hidden and streaming.slots in (2, 3)
                 if streaming.right:  # the left half streams first, as far as it can
                     assert streaming.left == hidden // streaming.unit * streaming.unit
                 if streaming.left:
-                    assert bytes_of(shape, stayed(streaming)) > SHARED_MEMORY - 2048
+                    assert bytes_of(layout, stayed(streaming)) > SHARED_MEMORY - 2048
     assert (256, 8, 18) in fitting and (128, 8, 47) in fitting
     assert (256, 1, 128) not in fitting
 
@@ -168,26 +165,26 @@ def test_a_small_model_stays_in_shared_memory():
 
 
 @pytest.mark.parametrize(
-    ("shape", "problem"),
+    ("layout", "problem"),
     [
-        (KernelShape(18, 6, 18, (256, 8)), None),
-        (KernelShape(18, 6, 18, ()), "there is no hidden layer"),
-        (KernelShape(18, 6, 18, (8, 257)), "hidden layers are wider than 256"),
-        (KernelShape(128, 6, 18, (64,)), None),
-        (KernelShape(129, 6, 18, (64,)), "observations have more than 128 entries"),
-        (KernelShape(18, 56, 200, (64,)), None),
+        (GpuLayout(18, 6, 18, (256, 8)), None),
+        (GpuLayout(18, 6, 18, ()), "there is no hidden layer"),
+        (GpuLayout(18, 6, 18, (8, 257)), "hidden layers are wider than 256"),
+        (GpuLayout(128, 6, 18, (64,)), None),
+        (GpuLayout(129, 6, 18, (64,)), "observations have more than 128 entries"),
+        (GpuLayout(18, 56, 200, (64,)), None),
         (
-            KernelShape(18, 57, 200, (64,)),
+            GpuLayout(18, 57, 200, (64,)),
             "features and action have more than 256 entries",
         ),
         (
-            KernelShape(128, 128, 128, (256,)),
+            GpuLayout(128, 128, 128, (256,)),
             "the model does not fit into the GPU's shared memory",
         ),
     ],
 )
-def test_what_is_too_large_is_said(shape, problem):
-    assert shape.problem() == problem
+def test_what_is_too_large_is_said(layout, problem):
+    assert layout.problem() == problem
 
 
 def test_the_header_has_every_constant():
@@ -207,11 +204,11 @@ def test_the_header_has_every_constant():
     }
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", LAYOUTS)
 def test_one_instruction_for_each_width_of_products(name):
-    shape = SHAPES[name]
-    text = shape.products()
-    widths = {shape.left, shape.width - shape.left, 2 * shape.head}
+    layout = LAYOUTS[name]
+    text = layout.products()
+    widths = {layout.left, layout.width - layout.left, 2 * layout.head}
     assert text.count("template <> struct Wgmma<") == len(widths)
     for width in widths:
         assert width % 8 == 0 and 8 <= width <= 256  # what the instruction takes
@@ -228,7 +225,7 @@ def test_one_instruction_for_each_width_of_products(name):
 
 
 def consumer(streaming, layers, steps):
-    """What a consumer of rollout.cu does with the ring and its turns, in order."""
+    """What a consumer of gpu_rollout.cu does with the ring and its turns, in order."""
     fits = streaming.left + streaming.right <= streaming.unit * streaming.slots
     done, unit = [], 0
     for _ in range(steps):
@@ -283,7 +280,7 @@ def test_consumers_and_producer_never_wait_for_each_other():
     seen = set()
     for width in range(8, 257, 8):
         for layers in (1, 2, 4, 8):
-            streaming = KernelShape(18, 6, 18, (width,) * layers).streaming()
+            streaming = GpuLayout(18, 6, 18, (width,) * layers).streaming()
             if streaming is None:
                 continue
             assert finishes(streaming, layers, tiles=1)

@@ -1,4 +1,4 @@
-"""Functions of row.h on a CPU: right over all of their range, in vectors too."""
+"""Functions of particle.h on a CPU: right over all of their range, in vectors too."""
 
 import ctypes
 import math
@@ -15,7 +15,7 @@ from jaxpets._src.kernel.build import Kind
 
 # Loops that a compiler makes vectors of, as in the kernel.
 SOURCE = """
-#include "row.h"
+#include "particle.h"
 #define OVER(name)                                                       \\
   extern "C" void name##_row(const float* x, float* out, int64_t size) { \\
     for (int64_t i = 0; i < size; ++i) out[i] = name(x[i]);              \\
@@ -35,7 +35,7 @@ extern "C" void normal_row(const uint32_t* bits, float* out, int64_t size) {
 NONE = np.array([np.nan, np.inf, -np.inf], np.float32)
 
 
-@pytest.fixture(scope="module", params=[Kind.REFERENCE, Kind.CPU])
+@pytest.fixture(scope="module", params=[Kind.GPU_REFERENCE, Kind.CPU])
 def call(request, tmp_path_factory):
     """Calls a function on many numbers, built as for the kernel or its reference."""
     folder = tmp_path_factory.mktemp("functions")

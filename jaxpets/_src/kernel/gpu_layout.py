@@ -1,10 +1,14 @@
-"""The sizes of one GPU kernel, and its parameters laid out as it reads them."""
+"""How a model lies in a GPU's memory: sizes, weights, instructions."""
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 
 # Of a block on an H100 or H200, without what CUDA keeps.
@@ -16,9 +20,11 @@ _MAX_COLUMNS = 256  # of one
 _RINGS = ((6, 2), (4, 3), (4, 2))
 _HALF_MAX = 65504.0
 
+IntArray: TypeAlias = npt.NDArray[np.integer[Any]]
+
 
 @dataclasses.dataclass(frozen=True)
-class KernelShape:
+class GpuLayout:
     """What is fixed when a GPU's kernel is compiled. Widths are those of the model.
 
     Attributes:
@@ -75,7 +81,7 @@ class KernelShape:
         streams of a layer is preferred.
         """
         chunks = _chunks(self.width)
-        found = []
+        found: list[Streaming] = []
         for most, slots in _RINGS:
             unit = min(most, chunks)
             half = chunks // unit * unit
@@ -125,43 +131,44 @@ class KernelShape:
         widths = sorted({self.left, self.width - self.left, 2 * self.head})
         return "\n".join(["template <int COLUMNS> struct Wgmma;", *map(_wgmma, widths)])
 
-    def pack(self, layers: list[dict[str, Array]]) -> Array:
+    def pack(self, layers: Sequence[Mapping[str, Array]]) -> Array:
         """Returns weights and biases `[E, *]` of all layers, float16.
 
         Args:
           layers: `kernel` `[E, in, out]` and `bias` `[E, out]` of each, in order.
         """
-        halves = (slice(None, self.left), slice(self.left, None))
-        entries = np.arange(self.obs_size)
-        head = np.concatenate([entries, self.head + entries])  # means, log-variances
-        numbers, places = [jnp.zeros((layers[0]["bias"].shape[0], 1), jnp.float16)], []
-        count = 1
-        for i, layer in enumerate(layers):
-            is_head = i == len(layers) - 1
-            # The kernel computes swish(2 h) = h + h tanh(h).
-            kernel, bias = (
-                layer[name] if is_head else layer[name] / 2
-                for name in ("kernel", "bias")
-            )
-            rounded = _half(bias)
-            rest = _half(bias - rounded.astype(jnp.float32))
-            whole = [_half(kernel), rounded[:, None], rest[:, None]]
-            numbers += [part.reshape(part.shape[0], -1) for part in whole]
-            inner, columns = kernel.shape[1:]
-            place = count + np.arange((inner + 2) * columns).reshape(-1, columns)
-            count += place.size
-            # What is not the layer's is the first number, the zero.
-            rows = self.input_size if i == 0 else self.width
-            width = 2 * self.head if is_head else self.width
-            matrix = np.zeros((_DEPTH * _chunks(rows), width), np.int32)
-            at = head if is_head else np.arange(columns)
-            matrix[:inner, at] = place[:inner]
-            matrix[rows : rows + 2, at] = place[inner:]
-            parts = [matrix] if is_head else [matrix[:, half] for half in halves]
-            places += map(_blocks, parts)
+        *hidden, head = layers
+        # The kernel computes swish(2 h) = h + h tanh(h).
+        halved = [{name: x / 2 for name, x in layer.items()} for layer in hidden]
+        members = head["bias"].shape[0]
+        numbers = [jnp.zeros((members, 1), jnp.float16)]
+        numbers += [_numbers(layer).reshape(members, -1) for layer in (*halved, head)]
         flat = jnp.concatenate(numbers, axis=1)
-        index = np.concatenate(places)
-        return flat.at[:, index].get(mode="promise_in_bounds")
+        return flat.at[:, self._sources()].get(mode="promise_in_bounds")
+
+    def _sources(self) -> IntArray:
+        """Returns, for every number that the kernel reads, which of the model's it is.
+
+        The model's are counted through its layers, from 1 on, each as `_numbers` has
+        it; 0 is the number zero, for what only fills the kernel's larger matrices up.
+        """
+        sizes = (self.input_size, *self.hidden_sizes, 2 * self.obs_size)
+        last = len(self.hidden_sizes)
+        matrices: list[IntArray] = []
+        first = 1
+        for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+            end = first + (inputs + 2) * outputs
+            layer = np.arange(first, end, dtype=np.int32).reshape(inputs + 2, outputs)
+            first = end
+            rows = self.width if i else self.input_size
+            if i == last:
+                entries = np.arange(self.obs_size)
+                columns = np.concatenate([entries, self.head + entries])
+                matrices.append(_placed(layer, rows, columns, 2 * self.head))
+            else:
+                matrix = _placed(layer, rows, np.arange(outputs), self.width)
+                matrices += [matrix[:, : self.left], matrix[:, self.left :]]
+        return np.concatenate([_blocks(matrix) for matrix in matrices])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,10 +189,35 @@ def _chunks(rows: int) -> int:
     return math.ceil((rows + 2) / _DEPTH)  # two more for the bias
 
 
-def _blocks(matrix: np.ndarray) -> np.ndarray:
-    """Lays out a layer, or half of one, as chunks of 16 rows, each as blocks of 8 x 8.
+def _numbers(layer: Mapping[str, Array]) -> Array:
+    """Returns a layer's numbers `[E, in + 2, out]` as float16.
 
-    The rows are those of the weights, then the bias as float16 and what that left.
+    The rows are those of the weights, then the biases rounded, and what that left.
+    """
+    bias = layer["bias"][:, None]
+    rounded = _half(bias)
+    rest = _half(bias - rounded.astype(jnp.float32))
+    return jnp.concatenate([_half(layer["kernel"]), rounded, rest], axis=1)
+
+
+def _placed(layer: IntArray, rows: int, columns: IntArray, width: int) -> IntArray:
+    """Returns the kernel's matrix of a layer: of whole chunks, 0 where nothing lies.
+
+    Args:
+      layer: the layer's matrix; its last two rows hold the biases.
+      rows: how many the kernel has for weights; the biases follow.
+      columns: where each of the layer's is in the kernel's matrix.
+      width: columns of the kernel's matrix.
+    """
+    matrix = np.zeros((_DEPTH * _chunks(rows), width), np.int32)
+    matrix[: len(layer) - 2, columns] = layer[:-2]
+    matrix[rows : rows + 2, columns] = layer[-2:]
+    return matrix
+
+
+def _blocks(matrix: IntArray) -> IntArray:
+    """Lays a matrix out as chunks of 16 rows, each as blocks of 8 x 8.
+
     Order within a chunk: 8 columns, two halves of the rows, column, row.
     """
     height, columns = matrix.shape

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxpets._src.kernel import row_code
-from jaxpets._src.kernel.row_code import UnsupportedError, row_function
+from jaxpets._src.kernel import jaxpr_to_cpp
+from jaxpets._src.kernel.jaxpr_to_cpp import UnsupportedError, cpp_function
 
 NAN, INF = np.nan, np.inf
 # Rows: ordinary numbers, those with an own rule, and those that are none.
@@ -173,9 +173,9 @@ def size_of(name):
 def library(tmp_path_factory):
     """All functions in one library, callable from here."""
     folder = tmp_path_factory.mktemp("rows")
-    lines = ['#include "row.h"']
+    lines = ['#include "particle.h"']
     for name, function in FUNCTIONS.items():
-        lines.append(row_function(f"f_{name}", function, SIZES))
+        lines.append(cpp_function(f"f_{name}", function, SIZES))
         pointer = f"reinterpret_cast<float (&)[{size_of(name)}]>(*out)"
         lines.append(
             f'extern "C" void {name}_row(const float* x, const float* y, float* out) {{'
@@ -186,7 +186,7 @@ def library(tmp_path_factory):
     source, built = folder / "rows.cc", folder / "rows.so"
     source.write_text("\n".join(lines))
     flags = ["-std=c++17", "-O1", "-shared", "-fPIC", "-Wall", "-Werror"]
-    headers = Path(row_code.__file__).parent
+    headers = Path(jaxpr_to_cpp.__file__).parent
     command = [shutil.which("c++"), *flags, f"-I{headers}", "-o", built, source]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -194,7 +194,7 @@ def library(tmp_path_factory):
 
 
 def test_every_expression_is_tested():
-    assert set(ELEMENTWISE) == set(row_code._ELEMENTWISE)
+    assert set(ELEMENTWISE) == set(jaxpr_to_cpp._ELEMENTWISE)
 
 
 @pytest.mark.parametrize("name", ELEMENTWISE)
@@ -226,10 +226,10 @@ def test_angles_of_many_turns(library, turns):
 
 
 def test_what_moves_costs_nothing():
-    text = row_function("f", lambda x, y: jnp.concatenate([y[::-1], x[1:2]]), SIZES)
+    text = cpp_function("f", lambda x, y: jnp.concatenate([y[::-1], x[1:2]]), SIZES)
     assert text == (
-        "template <class Row0, class Row1, class Out>\n"
-        "ROW_FUNCTION void f(const Row0& x, const Row1& y, Out&& out) {\n"
+        "template <class In0, class In1, class Out>\n"
+        "PARTICLE_FUNCTION void f(const In0& x, const In1& y, Out&& out) {\n"
         "  out[0] = y[3];\n  out[1] = y[2];\n  out[2] = y[1];\n"
         "  out[3] = y[0];\n  out[4] = x[1];\n}\n"
     )
@@ -237,13 +237,13 @@ def test_what_moves_costs_nothing():
 
 def test_what_is_known_is_computed_now():
     function = lambda x, y: x[:1] * jnp.cumsum(jnp.arange(4.0))[-1]  # noqa: E731
-    text = row_function("f", function, SIZES)
+    text = cpp_function("f", function, SIZES)
     assert "const float v0 = (x[0] * 0x1.8000000000000p+2f);" in text
     assert text.count("const float v") == 1
 
 
 def test_rows_have_the_sizes_that_were_asked_for():
-    text = row_function("f", lambda a: a[::-1], [("a", 7)])
+    text = cpp_function("f", lambda a: a[::-1], [("a", 7)])
     assert "out[0] = a[6];" in text and "out[6] = a[0];" in text
     assert "[7]" not in text
 
@@ -253,11 +253,11 @@ def test_strict_promotion_and_tracing_around_it():
     texts = []
 
     def outer(z):
-        texts.append(row_function("f", FUNCTIONS["folded"], SIZES))
+        texts.append(cpp_function("f", FUNCTIONS["folded"], SIZES))
         return z
 
     jax.jit(outer)(1.0)
-    assert texts == [row_function("f", FUNCTIONS["folded"], SIZES)]
+    assert texts == [cpp_function("f", FUNCTIONS["folded"], SIZES)]
 
 
 @pytest.mark.parametrize(
@@ -293,5 +293,5 @@ def test_strict_promotion_and_tracing_around_it():
 )
 def test_what_has_no_form_says_so(function, words):
     with pytest.raises(UnsupportedError) as error:
-        row_function("f", function, SIZES)
+        cpp_function("f", function, SIZES)
     assert str(error.value) == words

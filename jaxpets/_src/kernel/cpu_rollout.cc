@@ -13,7 +13,7 @@
 #include <mutex>
 #include <new>
 
-#include "tiles.h"
+#include "cpu_layout.h"
 // The layout comes first.
 #include "handler.h"
 

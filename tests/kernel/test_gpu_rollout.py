@@ -27,10 +27,9 @@ def pretend(monkeypatch, **attributes):
 )
 def test_on_other_gpus_it_is_the_scan(monkeypatch, attributes, capability):
     pretend(monkeypatch, **attributes)
-    fused, (warning,) = recorded(lambda: SMALL.fused(interpret=False))
-    words = f"the GPU's compute capability is {capability}, not 9.0"
-    assert str(warning.message) == f"fused_rollout runs as a scan: {words}."
-    assert callable(fused)
+    fused, _ = recorded(SMALL.fused)
+    assert fused.reason == f"the GPU's compute capability is {capability}, not 9.0"
+    assert not fused.uses_kernel
 
 
 def test_on_a_hopper_gpu_the_kernel_is_built(monkeypatch):
@@ -42,11 +41,10 @@ def test_on_a_hopper_gpu_the_kernel_is_built(monkeypatch):
         return "target"
 
     monkeypatch.setattr(module, "load_kernel", load_kernel)
-    _, caught = recorded(lambda: SMALL.fused(interpret=False))
-    _, more = recorded(lambda: SMALL.fused(interpret=True))
-    assert not caught and not more
-    (kernel, *of_gpu), (reference, *of_cpu) = asked
-    assert (of_gpu, of_cpu) == ([Kind.GPU], [Kind.REFERENCE])
+    _, caught = recorded(SMALL.fused)
+    assert not caught and SMALL.of_kind(Kind.GPU_REFERENCE).uses_kernel
+    (kernel, kind), (reference, other) = asked
+    assert (kind, other) == (Kind.GPU, Kind.GPU_REFERENCE)
     # The same model, with the instructions it needs.
     assert kernel.startswith(reference)
     assert "wgmma.mma_async" in kernel and "wgmma" not in reference
@@ -57,8 +55,8 @@ def test_on_a_hopper_gpu_the_kernel_is_built(monkeypatch):
 def test_the_kernel_equals_the_scan(name):
     case = dataclasses.replace(CASES[name], num_samples=70)  # blocks that are not full
     with jax.default_device(jax.devices("gpu")[0]):
-        fused, caught = recorded(lambda: case.fused(interpret=False))
-        assert not caught
+        fused, caught = recorded(case.fused)
+        assert not caught and fused.uses_kernel
         args = case.args()
         got, want = jax.jit(fused)(*args), jax.jit(case.scan())(*args)
         # Its tanh and its exponential have 11 and 22 bits.
@@ -84,7 +82,7 @@ def test_the_kernel_equals_the_scan_at_every_width(hidden_sizes, num_samples):
         CHEETAH, hidden_sizes=hidden_sizes, num_samples=num_samples
     )
     with jax.default_device(jax.devices("gpu")[0]):
-        fused, caught = recorded(lambda: case.fused(interpret=False))
-        assert not caught
+        fused, caught = recorded(case.fused)
+        assert not caught and fused.uses_kernel
         got, want = jax.jit(fused)(*case.args()), jax.jit(case.scan())(*case.args())
         assert relative_error(got, want) <= 1e-3

@@ -1,8 +1,8 @@
-"""The sizes of one rollout on a CPU, and its parameters laid out as it reads them."""
+"""How a model lies in a CPU's memory: sizes and weights."""
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import jax.numpy as jnp
 from jax import Array
@@ -11,7 +11,7 @@ _TILE = 6  # outputs of a layer whose sums fit into a core's registers
 
 
 @dataclasses.dataclass(frozen=True)
-class TileShape:
+class CpuLayout:
     """What is fixed when the rollout is compiled for a CPU.
 
     Attributes:
@@ -39,7 +39,7 @@ class TileShape:
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
         return "\n".join([*lines, f"constexpr int WIDTHS[] = {{{widths}}};"])
 
-    def pack(self, layers: list[dict[str, Array]]) -> Array:
+    def pack(self, layers: Sequence[Mapping[str, Array]]) -> Array:
         """Returns weights and biases `[E, *]` of all layers, float32.
 
         Args:
@@ -49,7 +49,7 @@ class TileShape:
         return jnp.concatenate(list(parts), axis=1)
 
 
-def _tiles(layer: dict[str, Array]) -> Iterator[Array]:
+def _tiles(layer: Mapping[str, Array]) -> Iterator[Array]:
     """Yields the whole tiles of a layer, then what is left of it, `[E, *]`.
 
     A tile has a row for the biases and one for every input.
