@@ -228,7 +228,9 @@ def _params_check(
 
     @functools.cache
     def template() -> EnsembleParams:
-        return jax.eval_shape(init, jax.random.key(0))
+        # Nothing is left in the program of whoever is being traced.
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        return jax.eval_shape(init, key)
 
     def check_params(params: EnsembleParams) -> None:
         check_record("params", params, EnsembleParams)

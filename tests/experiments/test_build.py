@@ -1,5 +1,3 @@
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import pytest
@@ -28,6 +26,11 @@ def test_pessimism_lowers_what_a_plan_is_worth():
     assert value("--pessimism", "0") == pytest.approx(plain)
 
 
+def a_rollout(reason):
+    """What `fused_rollout` returns, which imagines nothing."""
+    return jaxpets.typing.FusedRollout(lambda params: None, reason)
+
+
 @pytest.mark.parametrize("fallback", [False, True])
 @pytest.mark.parametrize(
     ("backend", "flags", "wanted"),
@@ -49,7 +52,7 @@ def test_a_search_is_unrolled_beside_a_kernel_of_a_gpu_only(
         searches.append(unroll)
         return search(**size)
 
-    search, fused = jaxpets.optimizers.cem, SimpleNamespace(uses_kernel=not fallback)
+    search, fused = jaxpets.optimizers.cem, a_rollout("none" if fallback else "")
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(jaxpets, "fused_rollout", lambda *_, **__: fused)
     monkeypatch.setattr(jaxpets.optimizers, "cem", cem)
@@ -78,7 +81,7 @@ def test_a_kernel_is_asked_for_where_there_may_be_one(
 
     def fused(model, **_):
         asked.append(model.config.precision)
-        return SimpleNamespace(uses_kernel=False)
+        return a_rollout("none")
 
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(jaxpets, "fused_rollout", fused)
