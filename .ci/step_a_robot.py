@@ -1,0 +1,11 @@
+"""Steps HalfCheetah once on both engines: what the extras of a wheel must be able to."""
+
+import jax
+
+from jaxpets.envs import half_cheetah
+
+for build in (half_cheetah.half_cheetah_native, half_cheetah.half_cheetah):
+    env = build()
+    state = jax.jit(env.step)(env.reset(jax.random.key(0)), env.action_high)
+    assert jax.numpy.isfinite(state.obs).all()
+    print(f"{build.__name__}: {state.obs[half_cheetah.FORWARD_VELOCITY]:.3f} m/s")
