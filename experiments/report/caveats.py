@@ -23,7 +23,7 @@ _FOR_LATER = {
 }
 
 
-def notes(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
+def sentences(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
     """Returns sentences on the logs of one preset.
 
     Args:
