@@ -73,7 +73,7 @@ def zero_shot(
     tasks = list(dict.fromkeys(task for by_task in scores.values() for task in by_task))
     names = [name.split(",")[0] for name in scores]
     with mpl.rc_context(style.STYLE):
-        figure = style.new_figure(9.0, 0.24 * len(scores) + 1.0)
+        figure = style.new_figure(9.0, 0.26 * len(scores) + 0.7)
         grid = figure.subplots(1, len(tasks), squeeze=False, sharey=True)[0]
         for axes, task in zip(grid, tasks, strict=True):
             axes.grid(axis="x")
@@ -89,9 +89,18 @@ def zero_shot(
                 paint = style.arm_color(name, names)
                 _spread(axes, place, by_task.get(task, np.array([])), paint)
             axes.set_xlim(left=0)
-        grid[0].set_yticks(range(len(scores)), list(scores))
+        grid[0].set_yticks(range(len(scores)), _with_seeds(scores))
+        for place in range(1, len(scores), 2):
+            for axes in grid:
+                axes.axhspan(place - 0.5, place + 0.5, color="#F6F6F6", zorder=0)
         grid[0].invert_yaxis()
         style.save(figure, target)
+
+
+def _with_seeds(scores: Mapping[str, Mapping[str, np.ndarray]]) -> list[str]:
+    """Returns the names with the largest number of seeds that a task has."""
+    counts = [max(map(len, by_task.values())) for by_task in scores.values()]
+    return [f"{name}  n={n}" for name, n in zip(scores, counts, strict=True)]
 
 
 def _spread(axes: Any, place: int, scores: np.ndarray, paint: str) -> None:
@@ -100,12 +109,11 @@ def _spread(axes: Any, place: int, scores: np.ndarray, paint: str) -> None:
     summary = stats.summarize(finite)
     if summary is None:
         return
-    axes.plot(finite, np.full(len(finite), place), "o", color=paint, markersize=2.5,
-              alpha=0.35, linewidth=0)  # fmt: skip
+    axes.plot(finite, np.full(len(finite), place - 0.22), "o", color=paint,
+              markersize=2.5, markeredgewidth=0, alpha=0.5)  # fmt: skip
     if summary.ci95 is not None:
-        axes.plot(summary.ci95, [place] * 2, color=paint, linewidth=1.6)
-    axes.plot(summary.mean, place, "o", color=paint, markeredgecolor="white",
-              markersize=6, zorder=4)  # fmt: skip
+        axes.plot(summary.ci95, [place + 0.12] * 2, color=paint, linewidth=1.8)
+    axes.plot(summary.mean, place + 0.12, "o", color=paint, markersize=4.5)
 
 
 def exploration(target: Path, value: Curves, turns: Curves) -> None:
