@@ -1,5 +1,6 @@
 """Sections of the report on the tasks: zero-shot, its variants, fine-tuning."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -110,21 +111,22 @@ def compared(rows: Sequence[Row], explored: int, picture: Path) -> list[str]:
 
 
 def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Returns what is worth subtracting: ours with all its variants, the rest with one.
+    """Returns which differences to show: what, and what is subtracted from it.
 
-    That is each pair of our arms in any variant, our arms with others in the same
-    variant, and a variant with what it is a variant of.
+    These are our arms in any variant with each other, our arms with the others in the
+    same variant, and a variant with what it varies.
     """
-    parts = {name: (name.split(", ")[0], name.split(", ")[1:]) for name in names}
     pairs = []
-    for i, one in enumerate(names):
-        for other in names[:i]:
-            (arm, tag), (other_arm, other_tag) = parts[one], parts[other]
-            ours = [arm in _OURS, other_arm in _OURS]
-            varied = arm == other_arm and not (tag and other_tag)
-            if all(ours) or varied or (any(ours) and tag == other_tag):
-                later = (one, other) if ours[0] or varied else (other, one)
-                pairs.append(later)
+    for first, second in itertools.combinations(names, 2):
+        arm, _, tag = first.partition(", ")
+        other, _, other_tag = second.partition(", ")
+        if arm == other or (arm in _OURS and other in _OURS):
+            if arm in _OURS or not tag:
+                pairs.append((second, first))
+        elif tag == other_tag and arm in _OURS:
+            pairs.append((first, second))
+        elif tag == other_tag and other in _OURS:
+            pairs.append((second, first))
     return pairs
 
 
