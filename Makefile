@@ -18,11 +18,13 @@ explore: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase zero-shot --out $(OUT) --video $(OUT)/cheetah.mp4
 	$(BIN)/python -m experiments.run --phase report --out $(OUT)
 
-# The reports on the runs at paper scale, from their logs.
+# The reports on the committed runs, from their logs, and the picture of the method.
 results: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase report --out results/paper
 	$(BIN)/python -m experiments.run --phase report --out results/paper-no-refit
+	$(BIN)/python -m experiments.run --phase report --out results/laptop
 	cp results/paper/report/table1.json results/table1.json
+	$(BIN)/python -m experiments.report.method_figure results/method.svg
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)

@@ -11,32 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator, ScalarFormatter
 
 from benchmarks import workloads
+from experiments.report import style
 
 PEERS = Path(__file__).parent / "results" / "peers.jsonl"
 # Of the tensor cores, bf16, dense, from the data sheet; other devices have no floor.
 PEAK_FLOPS = {"NVIDIA H200": 989e12}
 FLOOR = "tensor cores at their peak"
 ENGINES = {"scan": "jaxpets, scan", "kernel": "jaxpets, kernel"}
-# Okabe and Ito's palette, as in the report.
-_COLORS = {"scan": "#0072B2", "kernel": "#D55E00"}
+_COLORS = {"scan": style.BLUE, "kernel": style.VERMILLION}
 _MARKERS = ("s", "^", "D", "v", "P", "X")
-_GREY = "#7F7F7F"
-_STYLE: Any = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
-    "font.size": 9,
-    "grid.color": "#E5E5E5",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "svg.hashsalt": "jaxpets",  # equal rows give equal files
-}
 _PAPER = workloads.named_size("paper")
 Row = dict[str, Any]
 
@@ -109,9 +96,8 @@ def draw(rows: Iterable[Row], peers: Iterable[Row]) -> Figure:
     for peer in sorted(peers, key=lambda peer: -peer["ms_per_plan"]):
         if peer["device"] == rows[0]["device"]:
             best[peer["name"], peer["seeds"]] = peer
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9.0, 3.8), layout="constrained")
-        FigureCanvasAgg(figure)
+    with mpl.rc_context(style.STYLE):
+        figure = style.new_figure(9.0, 3.8)
         left, right = figure.subplots(1, 2, sharey=True)
         _panel(left, rows, "seeds", best.values())
         one = [peer for peer in best.values() if peer["seeds"] == 1]
@@ -150,13 +136,13 @@ def _panel(axes: Any, rows: list[Row], over: str, peers: Iterable[Row]) -> None:
         ticks.add(place)
         axes.plot(
             [place], [peer["ms_per_plan"]], _MARKERS[names.index(peer["name"])],
-            color=_GREY, label=peer["name"], markersize=5, linestyle="none",
+            color=style.GREY, label=peer["name"], markersize=5, linestyle="none",
         )  # fmt: skip
     if ticks and (device := rows[0]["device"]) in PEAK_FLOPS:
         ends = [min(ticks), max(ticks)]
         samples = ends if over == "num_samples" else [_PAPER.num_samples] * 2
         axes.plot(ends, [floor_ms(n, device) for n in samples], "--",
-                  color="#000000", label=FLOOR, linewidth=1.0)  # fmt: skip
+                  color=style.BLACK, label=FLOOR, linewidth=1.0)  # fmt: skip
     axes.set_xticks(sorted(ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
@@ -174,11 +160,7 @@ def main(argv: Sequence[str] | None = None) -> Figure:
         figure = draw(read(args.files), read([args.peers]))
     except (OSError, ValueError) as error:
         parser.error(str(error))
-    with mpl.rc_context(_STYLE):
-        # Without date and version, equal rows give equal files.
-        svg = args.out.suffix == ".svg"
-        gone = {"Date": None, "Creator": None} if svg else {"Software": None}
-        figure.savefig(args.out, metadata=gone)
+    style.save(figure, args.out)
     return figure
 
 

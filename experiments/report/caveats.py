@@ -23,7 +23,7 @@ _FOR_LATER = {
 }
 
 
-def notes(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
+def sentences(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
     """Returns sentences on the logs of one preset.
 
     Args:
@@ -93,10 +93,14 @@ def _missing(rows: Sequence[Row], found: Scores, explored: int) -> Iterator[str]
         lacks = [task for task in TASKS if not found.get(arm, {}).get(task)]
         if lacks:
             yield f"Missing: `{arm}` has {none} on {_list(lacks)}."
+        tasks_without: dict[tuple[int, ...], list[str]] = {}
         for task in (task for task in TASKS if task not in lacks):
-            left = sorted(seeds - set(found[arm][task]))
+            left = tuple(sorted(seeds - set(found[arm][task])))
+            tasks_without.setdefault(left, []).append(task)
+        for left, tasks in tasks_without.items():
             if left:
-                yield f"Missing: `{arm}` has {none} on {task} of seeds {_list(left)}."
+                of = f"on {_list(tasks)} of seeds {_list(left)}"
+                yield f"Missing: `{arm}` has {none} {of}."
     tuned = {
         row.arm for row in rows if row.phase == "finetune" and row.explored == explored
     }

@@ -6,35 +6,13 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-# Okabe and Ito's palette; an arm has the same colour in every figure.
-_COLORS = {
-    "epistemic": "#0072B2",
-    "best": "#000000",
-    "count": "#E69F00",
-    "count-16": "#D55E00",
-    "count-32": "#E69F00",
-    "random": "#7F7F7F",
-    "oracle": "#009E73",
-    "one-step": "#CC79A7",
-}
-_OTHER_COLORS = ("#56B4E9", "#8C564B")
-_STYLE: Any = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
-    "font.size": 9,
-    "grid.color": "#E5E5E5",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "savefig.dpi": 150,
-}
+from experiments.report import stats, style
+
 _LOG_RATIO = 1000.0  # a range that a linear axis would hide
 
 
@@ -60,8 +38,8 @@ def figure_4(target: Path, panels: Mapping[str, TaskPanels], explored: int) -> N
     """Draws exploration (left) and the task's reward (right), a row per task."""
     sides = [side for panel in panels.values() for side in panel]
     arms = list(dict.fromkeys(arm for side in sides for arm in side))
-    with mpl.rc_context(_STYLE):
-        figure = _figure(9.0, 2.3 * len(panels) + 0.9)
+    with mpl.rc_context(style.STYLE):
+        figure = style.new_figure(9.0, 2.3 * len(panels) + 0.9)
         grid = figure.subplots(
             len(panels), 2, squeeze=False, sharex="col", sharey="row",
             width_ratios=[1.6, 1.0],
@@ -70,14 +48,72 @@ def figure_4(target: Path, panels: Mapping[str, TaskPanels], explored: int) -> N
             _draw(row[0], panel.exploring, arms)
             _draw(row[1], panel.tuning, arms)
             for arm, scores in panel.jump_start.items():
-                _mark_start(row[1], explored, scores, color(arm, arms))
+                _mark_start(row[1], explored, scores, style.arm_color(arm, arms))
             row[0].set_ylabel(f"{task}\nreturn of a trial")
         grid[0, 0].set_title("exploring")
         grid[0, 1].set_title(f"the task's reward given after {explored} trials")
         for axes in grid[-1]:
             axes.set_xlabel("trial")
         _legend(figure, arms)
-        _save(figure, target)
+        style.save(figure, target)
+
+
+def zero_shot(
+    target: Path,
+    scores: Mapping[str, Mapping[str, np.ndarray]],
+    reference: Mapping[str, float],
+) -> None:
+    """Draws every seed's score, the mean and its interval: a panel per task.
+
+    Args:
+      target: file to write.
+      scores: `[S]` by what is compared, from top to bottom, and task.
+      reference: a return by task to compare with, such as the paper's; may be empty.
+    """
+    tasks = list(dict.fromkeys(task for by_task in scores.values() for task in by_task))
+    names = [name.split(",")[0] for name in scores]
+    with mpl.rc_context(style.STYLE):
+        figure = style.new_figure(9.0, 0.26 * len(scores) + 0.7)
+        grid = figure.subplots(1, len(tasks), squeeze=False, sharey=True)[0]
+        for axes, task in zip(grid, tasks, strict=True):
+            axes.grid(axis="x")
+            axes.set_axisbelow(True)
+            axes.set_title(task)
+            axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+            if task in reference:
+                axes.axvline(reference[task], color=style.VERMILLION, linestyle="--",
+                             linewidth=1.0)  # fmt: skip
+            for place, (name, by_task) in enumerate(
+                zip(names, scores.values(), strict=True)
+            ):
+                paint = style.arm_color(name, names)
+                _spread(axes, place, by_task.get(task, np.array([])), paint)
+            axes.set_xlim(left=0)
+        grid[0].set_yticks(range(len(scores)), _with_seeds(scores))
+        for place in range(1, len(scores), 2):
+            for axes in grid:
+                axes.axhspan(place - 0.5, place + 0.5, color="#F6F6F6", zorder=0)
+        grid[0].invert_yaxis()
+        style.save(figure, target)
+
+
+def _with_seeds(scores: Mapping[str, Mapping[str, np.ndarray]]) -> list[str]:
+    """Returns the names with the largest number of seeds that a task has."""
+    counts = [max(map(len, by_task.values())) for by_task in scores.values()]
+    return [f"{name}  n={n}" for name, n in zip(scores, counts, strict=True)]
+
+
+def _spread(axes: Any, place: int, scores: np.ndarray, paint: str) -> None:
+    """Draws the scores of seeds `[S]` in one row: each small, the mean large."""
+    finite = scores[np.isfinite(scores)]
+    summary = stats.summarize(finite)
+    if summary is None:
+        return
+    axes.plot(finite, np.full(len(finite), place - 0.22), "o", color=paint,
+              markersize=2.5, markeredgewidth=0, alpha=0.5)  # fmt: skip
+    if summary.ci95 is not None:
+        axes.plot(summary.ci95, [place + 0.12] * 2, color=paint, linewidth=1.8)
+    axes.plot(summary.mean, place + 0.12, "o", color=paint, markersize=4.5)
 
 
 def exploration(target: Path, value: Curves, turns: Curves) -> None:
@@ -86,8 +122,8 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
     Arms value different things, so each has its own axis; turns are shared.
     """
     arms = list(dict.fromkeys([*turns, *value]))
-    with mpl.rc_context(_STYLE):
-        figure = _figure(max(2.6 * len(arms), 5.0), 4.6)
+    with mpl.rc_context(style.STYLE):
+        figure = style.new_figure(max(2.6 * len(arms), 5.0), 4.6)
         grid = figure.subplots(2, len(arms), squeeze=False, sharex=True)
         for column, arm in enumerate(arms):
             above, below = grid[:, column]
@@ -97,7 +133,7 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
                     _draw(axes, {arm: curves[arm]}, arms, running_max=False)
                 else:
                     axes.set_yticks([])
-                    axes.text(0.5, 0.5, "none", color="#7F7F7F",
+                    axes.text(0.5, 0.5, "none", color=style.GREY,
                               transform=axes.transAxes, ha="center")  # fmt: skip
             _log_if_wide(above, value.get(arm))
             below.set_xlabel("trial")
@@ -105,7 +141,7 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
                 below.sharey(grid[1, 0])
         grid[0, 0].set_ylabel("exploration value\nper imagined step")
         grid[1, 0].set_ylabel("turns of the pitch\nin a trial")
-        _save(figure, target)
+        style.save(figure, target)
 
 
 def coverage(
@@ -119,8 +155,8 @@ def coverage(
     norm = LogNorm(low, max(float(seen.max()), 10 * low))
     columns = min(len(mean_counts), 3)
     rows = -(-len(mean_counts) // columns)
-    with mpl.rc_context(_STYLE):
-        figure = _figure(2.8 * columns + 1.2, 2.5 * rows + 0.5)
+    with mpl.rc_context(style.STYLE):
+        figure = style.new_figure(2.8 * columns + 1.2, 2.5 * rows + 0.5)
         grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axes in grid.flat[len(mean_counts) :]:
             axes.set_visible(False)
@@ -134,26 +170,7 @@ def coverage(
         figure.supxlabel("forward velocity, m/s", fontsize=9)
         figure.supylabel("pitch rate, rad/s (nose down > 0)", fontsize=9)
         figure.colorbar(mesh, ax=grid, label="transitions of a seed, mean")
-        _save(figure, target)
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, target: Path) -> None:
-    # Without the version of matplotlib, equal logs give equal files.
-    figure.savefig(target, metadata={"Software": None})
-
-
-def color(arm: str, arms: Sequence[str]) -> str:
-    """Returns an arm's colour; arms without their own share two more in turn."""
-    unknown = [name for name in arms if name not in _COLORS]
-    if arm in _COLORS:
-        return _COLORS[arm]
-    return _OTHER_COLORS[unknown.index(arm) % len(_OTHER_COLORS)]
+        style.save(figure, target)
 
 
 def _draw(
@@ -164,7 +181,7 @@ def _draw(
     axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
     axes.axhline(0.0, color="#BFBFBF", linewidth=0.8, zorder=1)
     for arm, (trials, values) in curves.items():
-        paint = color(arm, arms)
+        paint = style.arm_color(arm, arms)
         # A mean over fewer seeds would jump where one of them ends.
         mean = values.mean(axis=0)
         if len(values) > 1:
@@ -210,7 +227,9 @@ def _log_if_wide(axes: Any, curve: Curve | None) -> None:
 
 
 def _legend(figure: Figure, arms: Sequence[str]) -> None:
-    lines = [Line2D([], [], color=color(arm, arms), linewidth=2.0) for arm in arms]
+    lines = [
+        Line2D([], [], color=style.arm_color(arm, arms), linewidth=2.0) for arm in arms
+    ]
     lines.append(Line2D([], [], color="#404040", linewidth=0.6, alpha=0.6))
     lines.append(Line2D([], [], color="#404040", linewidth=1.0, linestyle=":"))
     labels = [*arms, "one seed", "best so far"]

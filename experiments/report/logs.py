@@ -23,7 +23,7 @@ class Row(NamedTuple):
     task: str  # empty while exploring
     trial: int
     explored: int  # exploration trials behind the model; 0 while exploring
-    tag: str  # of another attempt at phase 2; empty for the one that counts
+    tag: str  # of a variant of phase 2; empty for the one that Table 1 counts
     data: dict[str, Any]
     run: Path  # folder of the log
 
@@ -121,6 +121,13 @@ def read_json(path: Path) -> dict[str, Any]:
 def number(value: Any) -> float:
     """Returns a logged number; null, which stands for one not finite, is NaN."""
     return float("nan") if value is None else float(value)
+
+
+def named_by_tag(rows: Iterable[Row]) -> list[Row]:
+    """Returns the rows with their variant in the name of the arm: `best, no-refit`."""
+    return [
+        row._replace(arm=f"{row.arm}, {row.tag}") if row.tag else row for row in rows
+    ]
 
 
 def scores(rows: Iterable[Row], explored: int) -> Scores:

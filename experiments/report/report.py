@@ -7,8 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.report import coverage, coverage_section, figures, stats, tables
-from experiments.report.caveats import notes
+from experiments.report import (
+    caveats,
+    coverage,
+    coverage_section,
+    figures,
+    stats,
+    tables,
+    task_sections,
+)
 from experiments.report.coverage import Counts
 from experiments.report.figures import Curve, TaskPanels
 from experiments.report.logs import (
@@ -17,7 +24,6 @@ from experiments.report.logs import (
     Scores,
     exploring,
     load,
-    number,
     scores,
     tuning,
 )
@@ -26,16 +32,7 @@ from experiments.report.tables import TASKS
 __all__ = ["load", "write_report"]
 
 _PAPER_TRIALS = 60
-_OURS = ("best", "epistemic")  # what the other arms are baselines of
 
-_TABLE_1 = (
-    "The jump-start: the return of a trial under the task's reward before anything is "
-    "learned from it. A seed's score is the mean of its evaluation trials. Cells: mean "
-    "± standard deviation over seeds, [95 % bootstrap interval of the mean, seeds "
-    "resampled], interquartile mean (IQM) from four seeds on. Flips are named by "
-    "physics: a front flip turns nose down. The paper's Figure 3 has the names the "
-    "other way round, so its two flip rows may be exchanged."
-)
 _FIGURE_4 = (
     "Left: return under each task while exploring without it (the oracle has "
     "forward's). Right: zero-shot (dot: mean of all its seeds) and fine-tuning. Bold: "
@@ -47,6 +44,7 @@ _FIGURE_4 = (
 class _Files(NamedTuple):
     report: Path
     table_1: Path
+    zero_shot: Path  # only if a run has performed every task
     figure_4: Path
     exploration: Path
     coverage: Path  # only if a run has its coverage
@@ -80,13 +78,17 @@ def write_report(out: Path, target: Path) -> list[Path]:
         files = _Files(
             report=target / f"report{suffix}.md",
             table_1=target / f"table1{suffix}.json",
+            zero_shot=target / f"zero-shot{suffix}.png",
             figure_4=target / f"figure4{suffix}.png",
             exploration=target / f"exploration{suffix}.png",
             coverage=target / f"coverage{suffix}.png",
         )
         counts = seen.get(preset, {})
-        _write([row for row in rows if row.preset == preset], counts, out, files)
-        written += files if counts else files[:-1]
+        own = [row for row in rows if row.preset == preset]
+        for optional in (files.zero_shot, files.coverage):
+            optional.unlink(missing_ok=True)  # of a report on other logs
+        _write(own, counts, out, files)
+        written += [file for file in files if file.exists()]
     return written
 
 
@@ -109,11 +111,12 @@ def _write(
     lines = [
         f"# Report of preset `{rows[0].preset}`",
         "",
-        *(f"- {note}" for note in notes(rows, found, explored)),
+        *(f"- {text}" for text in caveats.sentences(rows, found, explored)),
         "",
-        *_zero_shot(rows, found, explored),
-        *_attempts(every),
-        *_fine_tuning(rows, explored),
+        *task_sections.zero_shot(rows, found, explored),
+        *task_sections.variants(every),
+        *task_sections.compared(every, explored, files.zero_shot),
+        *task_sections.fine_tuning(every, explored),
         "## Figure 4",
         "",
         f"![returns over trials]({files.figure_4.name})",
@@ -192,81 +195,6 @@ def _panels(rows: Sequence[Row], found: Scores, explored: int) -> dict[str, Task
             jump_start={arm: np.array(list(x.values())) for arm, x in starts.items()},
         )
     return panels
-
-
-def _zero_shot(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
-    """Returns the sections on tasks done without learning."""
-    counts = sorted({row.explored for row in rows if row.phase == "zero-shot"})
-    lines = [f"## Table 1: zero-shot return after {explored} exploration trials", ""]
-    if not found:
-        return [*lines, "No zero-shot log.", ""]
-    found = {arm: found[arm] for arm in tables.in_order(found)}
-    lines += tables.table_1(found, with_paper=rows[0].preset == "paper")
-    lines += [
-        _TABLE_1,
-        "",
-        *_random_actions(rows),
-        "### Every seed",
-        "",
-        *tables.every_seed(found),
-    ]
-    for ours in (arm for arm in _OURS if arm in found and len(found) > 1):
-        lines += ["### Probability of improvement", ""]
-        lines += tables.improvement(found, ours)
-    if len(counts) > 1:
-        lines += ["## Data efficiency: zero-shot return by exploration trials", ""]
-        lines += tables.by_trials({count: scores(rows, count) for count in counts})
-    return lines
-
-
-def _attempts(rows: Sequence[Row]) -> list[str]:
-    """Returns the section on zero-shots with other numbers, each under its tag."""
-    tagged = [row for row in rows if row.phase == "zero-shot" and row.tag]
-    if not tagged:
-        return []
-    lines = []
-    for tag, arm, explored in sorted({(r.tag, r.arm, r.explored) for r in tagged}):
-        own = [r for r in tagged if (r.tag, r.arm, r.explored) == (tag, arm, explored)]
-        by_task = scores(own, explored)[arm]
-        cells = [tables.cell(by_task.get(task, {}), full=True) for task in TASKS]
-        seeds = " ".join(map(str, sorted({row.seed for row in own})))
-        lines.append([tag, arm, str(explored), seeds, *cells])
-    text = "Zero-shot with other numbers (`--tag`), which the sections above leave out."
-    header = ["attempt", "arm", "explored trials", "seeds", *TASKS]
-    return ["## Other attempts", "", text, "", *tables.table(header, lines)]
-
-
-def _random_actions(rows: Sequence[Row]) -> list[str]:
-    """Returns what a trial of random actions returns, for scale."""
-    # The random trials at the start are the same in all arms of a seed.
-    random = {
-        (row.seed, row.trial): row
-        for row in rows
-        if row.data.get("planner") == "random"
-        or (row.phase, row.arm) == ("explore", "random")
-    }.values()
-    means = []
-    for task in TASKS:
-        values = np.array([number(row.data["returns"][task]) for row in random])
-        if np.isfinite(values).any():
-            means.append(f"{task} {tables.number(float(np.nanmean(values)))}")
-    if not means:
-        return []
-    text = f"Random actions, mean of {len(random)} trials: {', '.join(means)}."
-    return [text, ""]
-
-
-def _fine_tuning(rows: Sequence[Row], explored: int) -> list[str]:
-    lines = [f"## Fine-tuning after {explored} exploration trials", ""]
-    tables_by_task = [
-        tables.fine_tuning(task, {arm: tuned[arm] for arm in tables.in_order(tuned)})
-        for task in TASKS
-        if (tuned := tuning(rows, task, explored))
-    ]
-    if not tables_by_task:
-        return [*lines, "No fine-tuning log.", ""]
-    lines += ["Return of each trial; the first is planned with the explored model.", ""]
-    return lines + [line for table in tables_by_task for line in table]
 
 
 def _ablation(path: Path) -> list[str]:

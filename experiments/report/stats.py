@@ -1,15 +1,19 @@
-"""Statistics over seeds: few runs, so intervals and robust means, not only a mean.
+"""Statistics over seeds: intervals that hold for few of them, and a robust mean.
 
+The unit is a seed, and its score the mean over its evaluation trials. Intervals are
+Student's t: resampling seeds (the percentile bootstrap) covers the mean of five normal
+scores in 83 % of cases where it says 95 %, the t interval in 95 %.
+`tests/experiments/test_stats.py` measures both. The interquartile mean is that of
 Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice". The unit is a seed, and its score the mean over its evaluation trials.
+Precipice".
 """
 
-from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.stats
 
-Statistic = Callable[[np.ndarray], np.ndarray]  # [..., S] -> [...]
+_LEVEL = 0.95
 
 
 class Summary(NamedTuple):
@@ -22,9 +26,11 @@ class Summary(NamedTuple):
     ci95: tuple[float, float] | None  # of the mean; None for one seed
 
 
-def mean(scores: np.ndarray) -> np.ndarray:
-    """Returns the mean over the last axis, `[..., S]` to `[...]`."""
-    return scores.mean(axis=-1)
+class Difference(NamedTuple):
+    """The mean of one arm minus that of another, whose seeds are independent."""
+
+    mean: float
+    ci95: tuple[float, float] | None  # Welch's; None if an arm has one seed
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
@@ -37,40 +43,33 @@ def iqm(scores: np.ndarray) -> np.ndarray:
     return np.sort(scores, axis=-1)[..., cut : scores.shape[-1] - cut].mean(axis=-1)
 
 
-def bootstrap_interval(
-    strata: Sequence[np.ndarray],
-    statistic: Statistic = mean,
-    *,
-    seed: int = 0,
-    num_resamples: int = 10_000,
-    level: float = 0.95,
-) -> tuple[float, float] | None:
-    """Returns the stratified percentile bootstrap interval of a statistic.
-
-    Seeds are drawn with replacement within each stratum, and the statistic is taken
-    over all that were drawn.
-
-    Args:
-      strata: `[S_i]` scores each, such as one array per task, or one array.
-      statistic: over the last axis.
-      seed: of the resampling; equal scores give an equal interval.
-      num_resamples: more make the ends of the interval less noisy.
-      level: the share of resamples inside.
+def t_interval(scores: np.ndarray) -> tuple[float, float] | None:
+    """Returns Student's 95 % interval of the mean of scores `[S]`.
 
     Returns:
-      (low, high), or None if any stratum has fewer than two seeds: their spread is
-      not known.
+      (low, high), or None with fewer than two scores: their spread is not known.
     """
-    if not strata or min(len(scores) for scores in strata) < 2:
+    if len(scores) < 2:
         return None
-    generator = np.random.default_rng(seed)
-    drawn = [
-        scores[generator.integers(len(scores), size=(num_resamples, len(scores)))]
-        for scores in strata
-    ]
-    values = statistic(np.concatenate(drawn, axis=-1))
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+    mean, error = float(scores.mean()), float(scores.std(ddof=1)) / len(scores) ** 0.5
+    half = error * float(scipy.stats.t.ppf((1 + _LEVEL) / 2, len(scores) - 1))
+    return mean - half, mean + half
+
+
+def difference(ours: np.ndarray, theirs: np.ndarray) -> Difference:
+    """Returns mean `ours` `[S]` minus mean `theirs` `[T]`, with Welch's 95 % interval.
+
+    The two may have other spreads and other numbers of seeds. A seed that is in both
+    makes the interval too wide where its two scores go up and down together.
+    """
+    mean = float(ours.mean() - theirs.mean())
+    if min(len(ours), len(theirs)) < 2:
+        return Difference(mean, None)
+    if not (ours.std() or theirs.std()):
+        return Difference(mean, (mean, mean))
+    found = scipy.stats.ttest_ind(ours, theirs, equal_var=False)
+    low, high = found.confidence_interval(_LEVEL)
+    return Difference(mean, (float(low), float(high)))
 
 
 def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -79,7 +78,7 @@ def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
 
-def summarize(scores: np.ndarray, *, seed: int = 0) -> Summary | None:
+def summarize(scores: np.ndarray) -> Summary | None:
     """Summarizes scores `[S]`; scores that are not finite are left out.
 
     Returns:
@@ -88,11 +87,10 @@ def summarize(scores: np.ndarray, *, seed: int = 0) -> Summary | None:
     finite = scores[np.isfinite(scores)]
     if not len(finite):
         return None
-    std = float(finite.std(ddof=1)) if len(finite) > 1 else None
     return Summary(
         num_seeds=len(finite),
-        mean=float(mean(finite)),
-        std=std,
+        mean=float(finite.mean()),
+        std=float(finite.std(ddof=1)) if len(finite) > 1 else None,
         iqm=float(iqm(finite)),
-        ci95=bootstrap_interval([finite], seed=seed),
+        ci95=t_interval(finite),
     )

@@ -27,7 +27,8 @@ def in_order(arms: Collection[str]) -> list[str]:
     """Sorts arms: `best` and what else the paper lacks last."""
 
     def place(arm: str) -> tuple[int, str]:
-        family = "count" if arm.startswith("count-") else arm
+        family = arm.partition(",")[0]  # of "epistemic, no-refit" too
+        family = "count" if family.startswith("count-") else family
         return (ARMS.index(family) if family in ARMS else len(ARMS), arm)
 
     return sorted(arms, key=place)
@@ -43,7 +44,7 @@ def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Formats a return or a time; the number may be NaN."""
     if not np.isfinite(value):
         return "not finite"
@@ -61,16 +62,16 @@ def cell(scores: Mapping[int, float], *, full: bool = False) -> str:
     summary = stats.summarize(np.array(list(scores.values()), float))
     if summary is None:
         return "not finite" if scores else _MISSING
-    text = number(summary.mean)
+    text = format_number(summary.mean)
     if summary.std is None or summary.ci95 is None:
         return f"{text} (1 seed)"
-    text += f" ± {number(summary.std)}"
+    text += f" ± {format_number(summary.std)}"
     if not full:
         return f"{text} ({summary.num_seeds} seeds)"
-    low, high = map(number, summary.ci95)
+    low, high = map(format_number, summary.ci95)
     text += f"<br>[{low}, {high}]"
     few = summary.num_seeds < 4  # nothing to cut off
-    return text if few else f"{text}<br>IQM {number(summary.iqm)}"
+    return text if few else f"{text}<br>IQM {format_number(summary.iqm)}"
 
 
 def table_1(scores: Scores, *, with_paper: bool) -> list[str]:
@@ -94,7 +95,7 @@ def every_seed(scores: Scores) -> list[str]:
     for arm, by_task in scores.items():
         for seed in sorted({seed for task in by_task.values() for seed in task}):
             cells = [by_task.get(task, {}).get(seed) for task in TASKS]
-            shown = [_MISSING if x is None else number(x) for x in cells]
+            shown = [_MISSING if x is None else format_number(x) for x in cells]
             rows.append([arm, str(seed), *shown])
     return table(["arm", "seed", *TASKS], rows)
 
@@ -118,6 +119,38 @@ def improvement(scores: Scores, arm: str) -> list[str]:
 def _finite(scores: Mapping[int, float]) -> np.ndarray:
     values = np.array(list(scores.values()), float)
     return values[np.isfinite(values)]
+
+
+def differences(scores: Scores, pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """Returns the mean of one arm minus that of another, with Welch's interval."""
+    rows = []
+    for ours, theirs in pairs:
+        row = [ours, theirs]
+        for task in TASKS:
+            a, b = (_finite(scores[arm].get(task, {})) for arm in (ours, theirs))
+            found = stats.difference(a, b) if len(a) and len(b) else None
+            row.append(_MISSING if found is None else _difference(found))
+        rows.append(row)
+    return table(["mean of", "minus that of", *TASKS], rows)
+
+
+def _difference(found: stats.Difference) -> str:
+    text = format_number(found.mean)
+    if found.ci95 is None:
+        return text
+    low, high = map(format_number, found.ci95)
+    return f"{text} [{low}, {high}]"
+
+
+def variants(scores_at: Mapping[tuple[str, str, int], Scores]) -> list[str]:
+    """Returns zero-shot scores of runs with a tag, by tag, arm and explored trials."""
+    rows = []
+    for (tag, arm, explored), scores in sorted(scores_at.items()):
+        by_task = scores[arm]
+        cells = [cell(by_task.get(task, {}), full=True) for task in TASKS]
+        seeds = sorted({seed for task in by_task.values() for seed in task})
+        rows.append([tag, arm, str(explored), " ".join(map(str, seeds)), *cells])
+    return table(["variant", "arm", "explored trials", "seeds", *TASKS], rows)
 
 
 def by_trials(scores_at: Mapping[int, Scores]) -> list[str]:
@@ -152,7 +185,8 @@ def ablation(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     lines = []
     for row in rows:
         means = [
-            number(float(np.mean(np.concatenate(row["returns"][t])))) for t in TASKS
+            format_number(float(np.mean(np.concatenate(row["returns"][t]))))
+            for t in TASKS
         ]
         seeds = " ".join(map(str, row["seeds"]))
         lines.append([row["exploration"], row["refit"], row["search"], seeds, *means])

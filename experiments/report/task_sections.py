@@ -1,0 +1,166 @@
+"""Sections of the report on the tasks: zero-shot, its variants, fine-tuning."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.report import figures, tables
+from experiments.report.logs import Row, Scores, named_by_tag, number, scores, tuning
+from experiments.report.tables import TASKS
+
+_OURS = ("best", "epistemic")  # what the other arms are baselines of
+
+_TABLE_1 = (
+    "The jump-start: the return of a trial under the task's reward before anything is "
+    "learned from it. A seed's score is the mean of its evaluation trials. Cells: mean "
+    "± standard deviation over seeds, [95 % interval of the mean, Student's t over "
+    "seeds], interquartile mean (IQM) from four seeds on. Flips are named by "
+    "physics: a front flip turns nose down. The paper's Figure 3 has the names the "
+    "other way round, so its two flip rows may be exchanged."
+)
+_ZERO_SHOT = (
+    "Small dots: seeds. Large dot and line: their mean and its 95 % interval. After "
+    "the comma stands the tag of a variant."
+)
+_REFERENCE = " Dashed: the paper's SU-PETS, mean of three seeds."
+_DIFFERENCES = (
+    "Differences of means over seeds, [95 % interval, Welch's t]. Seeds count as "
+    "independent, also where both sides share them. No correction is made for the "
+    "number of comparisons."
+)
+_VARIANTS = (
+    "Zero-shot with other settings (`--tag`). Table 1 and the sections on it leave "
+    "them out."
+)
+
+
+def zero_shot(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
+    """Returns the sections on tasks that are performed without learning them.
+
+    Args:
+      rows: without those of variants.
+      found: their scores after `explored` trials.
+      explored: the exploration trials that Table 1 is about.
+    """
+    counts = sorted({row.explored for row in rows if row.phase == "zero-shot"})
+    lines = [f"## Table 1: zero-shot return after {explored} exploration trials", ""]
+    if not found:
+        return [*lines, "No zero-shot log.", ""]
+    found = {arm: found[arm] for arm in tables.in_order(found)}
+    lines += tables.table_1(found, with_paper=rows[0].preset == "paper")
+    lines += [
+        _TABLE_1,
+        "",
+        *_random_actions(rows),
+        "### Every seed",
+        "",
+        *tables.every_seed(found),
+    ]
+    for ours in (arm for arm in _OURS if arm in found and len(found) > 1):
+        lines += ["### Probability of improvement", ""]
+        lines += tables.improvement(found, ours)
+    if len(counts) > 1:
+        lines += ["## Data efficiency: zero-shot return by exploration trials", ""]
+        lines += tables.by_trials({count: scores(rows, count) for count in counts})
+    return lines
+
+
+def variants(rows: Sequence[Row]) -> list[str]:
+    """Returns the section on zero-shots with other settings, each under its tag."""
+    tagged = [row for row in rows if row.phase == "zero-shot" and row.tag]
+    if not tagged:
+        return []
+    by_variant: dict[tuple[str, str, int], list[Row]] = {}
+    for row in tagged:
+        by_variant.setdefault((row.tag, row.arm, row.explored), []).append(row)
+    found = {key: scores(own, key[2]) for key, own in by_variant.items()}
+    return ["## Variants", "", _VARIANTS, "", *tables.variants(found)]
+
+
+def compared(rows: Sequence[Row], explored: int, picture: Path) -> list[str]:
+    """Draws Table 1 with its variants, and returns the section on their differences.
+
+    Args:
+      rows: with those of variants.
+      explored: the exploration trials that Table 1 is about.
+      picture: file to write, if there is a score.
+    """
+    found = scores(named_by_tag(rows), explored)
+    found = {name: found[name] for name in tables.in_order(found)}
+    if not found:
+        return []
+    whole = {
+        name: {task: np.array(list(by_task[task].values())) for task in TASKS}
+        for name, by_task in found.items()
+        if set(TASKS) <= set(by_task)
+    }
+    is_paper = rows[0].preset == "paper"
+    reference: dict[str, float] = {}
+    if is_paper:
+        reference = dict(zip(TASKS, tables.PAPER_TABLE_1["SU-PETS"], strict=True))
+    lines = ["## Arms and variants side by side", ""]
+    if whole:
+        figures.zero_shot(picture, whole, reference)
+        text = _ZERO_SHOT + _REFERENCE * is_paper
+        lines += [f"![zero-shot returns]({picture.name})", "", text, ""]
+    if pairs := _pairs(list(found)):
+        lines += [_DIFFERENCES, "", *tables.differences(found, pairs)]
+    return lines
+
+
+def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Returns which differences to show: what, and what is subtracted from it.
+
+    These are our arms in any variant with each other, our arms with the others in the
+    same variant, and a variant with what it varies.
+    """
+    pairs = []
+    for first, second in itertools.combinations(names, 2):
+        arm, _, tag = first.partition(", ")
+        other, _, other_tag = second.partition(", ")
+        if arm == other or (arm in _OURS and other in _OURS):
+            if arm in _OURS or not tag:
+                pairs.append((second, first))
+        elif tag == other_tag and arm in _OURS:
+            pairs.append((first, second))
+        elif tag == other_tag and other in _OURS:
+            pairs.append((second, first))
+    return pairs
+
+
+def _random_actions(rows: Sequence[Row]) -> list[str]:
+    """Returns what a trial of random actions returns, for scale."""
+    # The random trials at the start are the same in all arms of a seed.
+    random = {
+        (row.seed, row.trial): row
+        for row in rows
+        if row.data.get("planner") == "random"
+        or (row.phase, row.arm) == ("explore", "random")
+    }.values()
+    means = []
+    for task in TASKS:
+        values = np.array([number(row.data["returns"][task]) for row in random])
+        if np.isfinite(values).any():
+            mean = tables.format_number(float(np.nanmean(values)))
+            means.append(f"{task} {mean}")
+    if not means:
+        return []
+    text = f"Random actions, mean of {len(random)} trials: {', '.join(means)}."
+    return [text, ""]
+
+
+def fine_tuning(rows: Sequence[Row], explored: int) -> list[str]:
+    """Returns the section on fine-tuning; variants are columns of their own."""
+    lines = [f"## Fine-tuning after {explored} exploration trials", ""]
+    named = named_by_tag(rows)
+    by_task = [
+        tables.fine_tuning(task, {arm: tuned[arm] for arm in tables.in_order(tuned)})
+        for task in TASKS
+        if (tuned := tuning(named, task, explored))
+    ]
+    if not by_task:
+        return [*lines, "No fine-tuning log.", ""]
+    lines += ["Return of each trial; the first is planned with the explored model.", ""]
+    return lines + [line for table in by_task for line in table]
