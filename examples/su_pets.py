@@ -22,7 +22,7 @@ PAPER = SimpleNamespace(
     samples=500, elites=50, iterations=5, precision=jaxpets.Precision.BF16,
 )  # fmt: skip
 SMALL = SimpleNamespace(
-    trials=20, steps=250, hidden_sizes=(100,) * 2, epochs=10, particles=5, horizon=15,
+    trials=24, steps=250, hidden_sizes=(100,) * 2, epochs=10, particles=5, horizon=15,
     samples=64, elites=8, iterations=3, precision=jaxpets.Precision.F32,
 )  # fmt: skip
 TINY = SimpleNamespace(**vars(SMALL) | {"trials": 2, "steps": 10})
