@@ -1,4 +1,4 @@
-"""Steps HalfCheetah once on both engines: what the extras of a wheel must be able to."""
+"""Steps HalfCheetah once on both engines, which each extra must be able to do."""
 
 import jax
 
