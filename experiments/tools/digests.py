@@ -56,6 +56,7 @@ def cases() -> dict[str, list[list[str]]]:
     own = ["--preset", "smoke", "--engine", "mujoco", "--seeds", "3", "7"]
     refit = ["--refit.num-epochs", "2", "--tag", "refit", "--pessimism", "0.5"]
     mppi = ["--tag", "mppi", "--task-planner.optimizer", "mppi"]
+    mppi.append("--task-planner.no-fused")
     found["smoke-two-seeds"] = [
         ["--phase", "explore", *own],
         ["--phase", "zero-shot", *own, *refit],

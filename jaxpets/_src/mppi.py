@@ -100,7 +100,7 @@ def mppi(
 
         keys = jax.random.split(key, (num_iterations, 2))
         mean, values = jax.lax.scan(iterate, state.mean, keys)
-        solution = Solution(actions=mean, value=values[-1])
-        return solution, MPPIState(mean=box.shift(mean))
+        state = MPPIState(mean=box.shift(mean))
+        return Solution(actions=mean, value=values[-1]), state
 
     return TrajectoryOptimizer(init, step)
