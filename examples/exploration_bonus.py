@@ -19,7 +19,7 @@ import jaxpets
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--tiny", action="store_true", help="for a test of this file")
 tiny = parser.parse_args().tiny
-num_trials, trial_length, num_seeds = (2, 10, 1) if tiny else (8, 50, 3)
+num_trials, trial_length, num_seeds = (2, 10, 1) if tiny else (8, 50, 2)
 
 TORQUE, MAX_SPEED, TIMESTEP = jnp.full(1, 2.0), 8.0, 0.1  # N m, rad/s, s
 
