@@ -109,6 +109,7 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
         return FusedRollout(lambda params: functools.partial(scan, params), str(error))
 
     def bind(params: EnsembleParams) -> Callable[[Array, Array, Array], Array]:
+        _check_params(params)
         layers = params.network.members["params"]
         weights = layout.pack([layers[f"layer_{i}"] for i in range(len(layers))])
         shared = _shared(config, params)
@@ -145,6 +146,12 @@ def _origin(model: Any) -> tuple[EnsembleConfig, ModelSpace]:
             "own use particle_rollout."
         )
     return model.config, model.space
+
+
+def _check_params(params: Any) -> None:
+    if not isinstance(params, EnsembleParams):
+        kind = type(params).__name__
+        raise TypeError(f"params must be the ensemble's EnsembleParams, got {kind}.")
 
 
 def _layout(

@@ -182,6 +182,12 @@ def test_params_of_another_ensemble_are_refused(engine, change):
     assert said[0] == said[1]
 
 
+@pytest.mark.parametrize("params", [None, {}, jnp.zeros(3)])
+def test_params_that_are_none_of_an_ensemble_are_refused(engine, params):
+    with pytest.raises(TypeError, match="params must be the ensemble's EnsembleParams"):
+        engine.fused(SMALL)(params, *SMALL.args()[1:])
+
+
 def test_wrong_shapes_are_refused(engine):
     params, key, obs, actions = SMALL.args()
     with pytest.raises(ValueError, match=r"obs must be float32\[3\], got float32\[2\]"):
