@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_key
+from jaxpets._src.checks import check_array, check_key, check_record
 from jaxpets._src.chunks import WINDOW
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig
@@ -109,6 +109,7 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
         return FusedRollout(lambda params: functools.partial(scan, params), str(error))
 
     def bind(params: EnsembleParams) -> Callable[[Array, Array, Array], Array]:
+        check_record("params", params, EnsembleParams)
         layers = params.network.members["params"]
         weights = layout.pack([layers[f"layer_{i}"] for i in range(len(layers))])
         shared = _shared(config, params)
@@ -133,11 +134,9 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
     return FusedRollout(bind)
 
 
-def _origin(model: Any) -> tuple[EnsembleConfig, ModelSpace]:
+def _origin(model: Ensemble) -> tuple[EnsembleConfig, ModelSpace]:
     """Returns what a model was built from."""
-    if not isinstance(model, Ensemble):
-        kind = type(model).__name__
-        raise TypeError(f"model must be an Ensemble of jaxpets.ensemble, got {kind}.")
+    check_record("model", model, Ensemble)
     if model.config is None or model.space is None:
         raise ValueError(
             "model must be built by jaxpets.ensemble: a kernel is made from its config "

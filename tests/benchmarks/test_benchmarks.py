@@ -294,7 +294,8 @@ def test_where_no_kernel_runs_none_is_timed(monkeypatch):
     device = SimpleNamespace(platform="tpu")
     monkeypatch.setattr(jax, "devices", lambda: [device])
     monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
-    with pytest.raises(SystemExit, match=r"no kernel to time: .* is a tpu, not a"):
+    text = r"no kernel to time: .* is a tpu, not a"
+    with pytest.warns(UserWarning), pytest.raises(SystemExit, match=text):
         plan.main(["--tiny", "--seeds", "1", "--engine", "kernel"])
 
 

@@ -6,11 +6,14 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import pytest
 from rollouts import ENGINES
 
 import jaxpets
 
+# In a script: $2 is then where the library goes.
+OUTPUT = 'while [ "$1" != -o ]; do shift; done'
 SOURCES = Path(jaxpets.__file__).parent / "_src" / "kernel"
 
 
@@ -63,3 +66,54 @@ def assert_constants(tmp_path):
         assert not done.returncode, done.stderr
 
     return check
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    """The cache folder of this test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "jaxpets"
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """FFI targets that were registered, and their platforms."""
+    seen = []
+
+    def register(name, capsule, *, platform):
+        seen.append((name, platform))
+
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", register)
+    return seen
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory):
+    """A library with the kernel's symbol, and nothing in it."""
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "tiny.c").write_text("int jaxpets_rollout(void) { return 0; }")
+    command = ["cc", "-shared", "-fPIC", "-o", folder / "tiny.so", folder / "tiny.c"]
+    subprocess.run(command, check=True)
+    return folder / "tiny.so"
+
+
+class Making:
+    """A script for a compiler that makes the same library of everything.
+
+    `commands` are the words of each call, the compiler's own file first.
+    """
+
+    def __init__(self, library, log):
+        self.script = f'echo "$0 $*" >> {log}; {OUTPUT}; cp {library} "$2"'
+        self._log = log
+        log.touch()
+
+    @property
+    def commands(self):
+        return [line.split() for line in self._log.read_text().splitlines()]
+
+
+@pytest.fixture
+def making(tiny, tmp_path):
+    """A Making of this test."""
+    return Making(tiny, tmp_path / "log")

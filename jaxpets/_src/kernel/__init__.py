@@ -1,30 +1,30 @@
 """The rollout of an ensemble as one compiled kernel: a map of this folder.
 
-`jaxpets.fused_rollout` puts these together. Two kernels compute the same rollout: one
-for Hopper GPUs in float16 (`gpu_*`), one for CPUs in float32 (`cpu_*`). The GPU's has a
+`jaxpets.fused_rollout` puts the parts together. Two kernels compute the same rollout:
+one for Hopper GPUs in float16 (gpu_*), one for CPUs in float32 (cpu_*). The GPU's has a
 reference in plain C++, for tests on machines without one.
 
-The code. What depends on the model is generated, all else is fixed source:
+The code. What depends on the model is generated into model.h, all else is fixed:
 
-    ModelSpace -> jaxpr -> C++   jaxpr_to_cpp.cpp_function ┐
-    sizes -> constants           {gpu,cpu}_layout.header   ├> model.h
-    tensor core instructions     gpu_layout.products       ┘
-    model.h + sources -> .so -> FFI target                   build.load_kernel
+    ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function
+    sizes -> constants                       {gpu,cpu}_layout.header
+    widths -> tensor core instructions       gpu_layout.products
+    model.h and sources -> .so -> FFI target    build.load_kernel
 
-The numbers. They are laid out once per plan, and handed over at every call:
+The numbers. Parameters are packed once per plan, and handed over at every call:
 
-    EnsembleParams -> weights, in the order of reading     {gpu,cpu}_layout.pack
+    parameters -> weights, as the kernel reads them    {gpu,cpu}_layout.pack
     weights, shared numbers, keys, obs, actions -> path    the FFI call
 
-Who includes whom; an arrow points at what is included:
+Who includes whom:
 
-    gpu_rollout.cu    -> gpu_layout.h, handler.h, wgmma.h  (tensor core instructions)
-    gpu_reference.cc  -> gpu_layout.h, handler.h
-    cpu_rollout.cc    -> cpu_layout.h, handler.h
-    handler.h         -> rollout.h, XLA's FFI              (operands from XLA)
-    rollout.h         -> sizes.h                           (operands, steps of one)
-    {gpu,cpu}_layout.h -> sizes.h                          (where each weight lies)
-    sizes.h -> model.h -> particle.h                       (functions of one particle)
+    gpu_rollout.cu      gpu_layout.h, handler.h, wgmma.h
+    gpu_reference.cc    gpu_layout.h, handler.h
+    cpu_rollout.cc      cpu_layout.h, handler.h
+    handler.h           rollout.h and XLA's headers: the operands as XLA hands them over
+    rollout.h           sizes.h: the operands, and how far apart their numbers lie
+    *_layout.h          sizes.h: where each weight lies, and their type
+    sizes.h             model.h, and that particle.h: functions of one particle
 
-The layout comes before handler.h: the operands are of its type `Weight`.
+A layout comes before handler.h, which needs the type of the weights.
 """

@@ -144,13 +144,13 @@ class GpuLayout:
         numbers = [jnp.zeros((members, 1), jnp.float16)]
         numbers += [_numbers(layer).reshape(members, -1) for layer in (*halved, head)]
         flat = jnp.concatenate(numbers, axis=1)
-        return flat.at[:, self._sources()].get(mode="promise_in_bounds")
+        return flat.at[:, self._places()].get(mode="promise_in_bounds")
 
-    def _sources(self) -> IntArray:
-        """Returns, for every number that the kernel reads, which of the model's it is.
+    def _places(self) -> IntArray:
+        """Returns, for every number that the kernel reads, its place in the model.
 
-        The model's are counted through its layers, from 1 on, each as `_numbers` has
-        it; 0 is the number zero, for what only fills the kernel's larger matrices up.
+        Places are counted through the layers, from 1 on, each as `_numbers` has it. At
+        place 0 is a zero, which fills the kernel's matrices up to their larger sizes.
         """
         sizes = (self.input_size, *self.hidden_sizes, 2 * self.obs_size)
         last = len(self.hidden_sizes)

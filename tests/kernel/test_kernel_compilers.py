@@ -1,0 +1,112 @@
+"""Which compiler is taken, and what is said of one that fails."""
+
+import os
+import shlex
+import shutil
+import sys
+
+import pytest
+
+from jaxpets._src.kernel import build
+from jaxpets._src.kernel.build import BuildError, Kind
+
+pytestmark = pytest.mark.usefixtures("cache", "registered")
+# Without a cache in memory: what a process does the first time.
+load = build.load_kernel.__wrapped__
+# In a script: $2 is then where the library goes.
+OUTPUT = 'while [ "$1" != -o ]; do shift; done'
+
+
+def test_a_processor_that_is_not_known_says_so(compiler, making, registered):
+    said = "cc1plus: error: bad value ('native') for '-march=' switch"
+    compiler(
+        making.script, processor=f"echo {shlex.quote(said)} >&2; echo note >&2; exit 1"
+    )
+    with pytest.raises(BuildError) as error:
+        load("// one", Kind.CPU)
+    assert str(error.value) == f"c++ failed: {said}"
+    assert not making.commands and not registered  # nothing is compiled
+
+
+def test_a_compiler_that_cannot_be_run_says_so(compiler):
+    compiler("").write_text("")
+    for kind in (Kind.CPU, Kind.GPU_REFERENCE):
+        with pytest.raises(BuildError, match=r"^cannot run c\+\+: [^\n]*$"):
+            load("// one", kind)
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (
+            "In file included from a.h\na.h:3: error: first\na.h:4: error: second",
+            r"^c\+\+ failed: a.h:3: error: first$",
+        ),
+        ("killed\nsoon", r"^c\+\+ failed: killed$"),
+    ],
+)
+def test_a_failure_leaves_nothing_behind(cache, compiler, said, words):
+    compiler(f'{OUTPUT}; echo half > "$2"; echo {shlex.quote(said)} >&2; exit 1')
+    with pytest.raises(BuildError, match=words):
+        load("// one", Kind.GPU_REFERENCE)
+    assert list(cache.iterdir()) == []
+
+
+def test_a_broken_library_says_so(compiler, registered):
+    compiler(f'{OUTPUT}; echo no library > "$2"')
+    with pytest.raises(BuildError, match=r"^cannot load the compiled kernel: .*\.so"):
+        load("// one", Kind.GPU_REFERENCE)
+    assert not registered
+
+
+# Compilers that are found.
+
+
+@pytest.mark.parametrize("names", [["c++"], ["g++", "clang++"], ["clang++"]])
+def test_the_first_compiler_that_is_there(compiler, making, names):
+    first = compiler(making.script, name=names[0])
+    for name in names[1:]:
+        shutil.copy(first, first.with_name(name))
+    load("// one", Kind.GPU_REFERENCE)
+    assert making.commands[0][0] == str(first)
+
+
+def test_without_a_compiler_it_says_so(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BuildError, match=r"^no C\+\+ compiler found \(c\+\+, g\+\+"):
+        load("// one", Kind.GPU_REFERENCE)
+
+
+def test_nvcc_is_looked_for_in_three_places(monkeypatch, tmp_path, compiler, making):
+    """On the path, in CUDA_HOME, in the package that JAX brings."""
+    on_path = compiler(making.script, name="nvcc")
+    in_home = tmp_path / "home" / "bin" / "nvcc"
+    in_wheel = tmp_path / "site" / "nvidia" / "cu13" / "bin" / "nvcc"
+    for place in (in_home, in_wheel):
+        place.parent.mkdir(parents=True)
+        shutil.copy(on_path, place)
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "site")])
+    monkeypatch.delitem(sys.modules, "nvidia", raising=False)
+
+    def used(model):
+        load(f"// {model}", Kind.GPU)
+        return making.commands[-1]
+
+    name, *flags = used("one")
+    assert name == str(on_path)
+    assert "-gencode=arch=compute_90a,code=sm_90a" in flags
+    on_path.unlink()
+    assert used("two")[0] == str(in_home)
+    library = f"-L{in_wheel.parents[1] / 'lib'}"
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "elsewhere"))
+    name, *flags = used("three")
+    assert name == str(in_wheel) and library in flags
+    monkeypatch.delenv("CUDA_HOME")
+    assert used("four")[0] == str(in_wheel)
+    in_wheel.unlink()
+    with pytest.raises(BuildError, match=r"^no nvcc found; pip install 'jaxpets"):
+        load("// five", Kind.GPU)
+    monkeypatch.setattr(sys, "path", [os.devnull])
+    with pytest.raises(BuildError, match=r"^no nvcc found; pip install 'jaxpets"):
+        load("// six", Kind.GPU)
