@@ -1,5 +1,6 @@
 """The cross-entropy method over action sequences, as PETS uses it."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,9 @@ from jaxpets._src.checks import (
 )
 from jaxpets._src.elites import select_elites
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+
+# Mean and variance, both `[H, A]`, and the value `[]` of the elites.
+_Carry = tuple[Array, Array, Array]
 
 
 class CEMState(NamedTuple):
@@ -113,7 +117,7 @@ def cem(
         check_record("state", state, CEMState)
         check_array("state.mean", state.mean, shape)
 
-        def iterate(carry: tuple, keys: Array) -> tuple[tuple, None]:
+        def iterate(carry: _Carry, keys: Array) -> tuple[_Carry, None]:
             mean, variance, _value = carry
             sample_key, value_key = keys
             actions = sample(sample_key, mean, variance)
@@ -127,9 +131,8 @@ def cem(
                 elites.value,
             )
             searching = jnp.max(variance / box.half_width**2) > min_variance
-            return jax.tree.map(
-                lambda a, b: jnp.where(searching, a, b), new, carry
-            ), None
+            keep = functools.partial(jnp.where, searching)
+            return jax.tree.map(keep, new, carry), None
 
         variance = jnp.broadcast_to(box.half_width**2 / 4, shape)
         start = (state.mean, variance, jnp.zeros((), jnp.float32))

@@ -5,7 +5,7 @@ Every message names the argument, what was wanted and what came.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,14 @@ def check_count(name: str, value: Any, minimum: int = 1) -> None:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
 
 
+def is_sequence(values: Any) -> TypeGuard[Sequence[Any]]:
+    """Tells whether `values` is a tuple or a list."""
+    return isinstance(values, (tuple, list))
+
+
 def check_counts(name: str, values: Any) -> None:
     """Raises unless `values` is a tuple or list of positive Python integers."""
-    if not isinstance(values, (tuple, list)):
+    if not is_sequence(values):
         raise TypeError(f"{name} must be a tuple of ints, got {values!r}.")
     for value in values:
         check_count(name, value)
@@ -38,8 +43,7 @@ def check_flag(name: str, value: Any) -> None:
 
 def check_real(name: str, value: Any, low: float, high: float = math.inf) -> None:
     """Raises unless `value` is a finite Python number in `[low, high]`."""
-    numbers = (int, float, np.integer, np.floating)
-    if isinstance(value, bool) or not isinstance(value, numbers):
+    if isinstance(value, bool) or not _is_number(value):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python float, got {value!r} ({kind}).")
     if not (math.isfinite(value) and low <= value <= high):
@@ -51,7 +55,7 @@ def check_real(name: str, value: Any, low: float, high: float = math.inf) -> Non
 
 def check_reals(name: str, values: Any, low: float) -> None:
     """Raises unless `values` is a tuple or list of finite numbers of at least `low`."""
-    if not isinstance(values, (tuple, list)):
+    if not is_sequence(values):
         raise TypeError(f"{name} must be a tuple of floats, got {values!r}.")
     for value in values:
         check_real(name, value, low)
@@ -80,15 +84,23 @@ def check_like(name: str, value: Any, template: Any) -> None:
       value: a pytree of arrays, concrete or traced.
       template: a pytree of arrays or of `jax.ShapeDtypeStruct`s.
     """
-    structure = jax.tree.structure(value)
-    wanted = jax.tree.structure(template)
+    structure = cast(Any, jax.tree.structure(value))
+    wanted = cast(Any, jax.tree.structure(template))
     if structure != wanted:
         raise ValueError(f"{name} must have the structure {wanted}, got {structure}.")
-    leaves = jax.tree_util.tree_leaves_with_path(template)
+    leaves = cast(list[Any], jax.tree_util.tree_leaves_with_path(template))
     for (path, want), got in zip(leaves, jax.tree.leaves(value), strict=True):
         if _aval(got) != _aval(want):
             leaf = f"{name}{jax.tree_util.keystr(path)}"
             raise ValueError(f"{leaf} must be {_aval(want)}, got {_aval(got)}.")
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, (int, float, np.integer, np.floating))
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, (Array, np.ndarray, np.generic, int, float))
 
 
 def _aval(x: Any) -> str:
@@ -102,7 +114,7 @@ def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> Non
     matches any number of axes.
     """
     text = ", ".join("?" if want is None else str(want) for want in shape)
-    if not isinstance(value, (Array, np.ndarray, np.generic, int, float)):
+    if not _is_array(value):
         kind = type(value).__name__
         raise TypeError(f"{name} must be float32[{text}], got {value!r} ({kind}).")
     got = jnp.shape(value)

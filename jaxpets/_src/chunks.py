@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,7 @@ def chunked(
             return jax.lax.dynamic_update_slice_in_dim(values, value, first, 0)
 
         values = jnp.zeros((total,), jnp.float32)
-        return jax.lax.fori_loop(0, num_chunks, chunk, values)
+        return cast(Array, jax.lax.fori_loop(0, num_chunks, chunk, values))
 
     return objective
 
@@ -92,7 +93,9 @@ def window(key: Array, first: Array, count: int, total: int) -> Array:
         member = jax.lax.broadcasted_iota(jnp.uint32, shape, 0)
         index = here + (member * jnp.uint32(total - count) + data[2]) * jnp.uint32(size)
         zeros = jnp.zeros(shape, jnp.uint32)
-        high, low = threefry2x32_p.bind(data[0], data[1], zeros, index)
+        high, low = cast(
+            list[Array], threefry2x32_p.bind(data[0], data[1], zeros, index)
+        )
         return (high ^ low).astype(f"uint{bit_width}")
 
     window_of_threefry = define_prng_impl(
@@ -120,4 +123,4 @@ def _fold_in(data: Array, number: Array | int) -> Array:
 
 
 def _whole(data: Array) -> Array:
-    return jax.random.wrap_key_data(data[:2], impl=_THREEFRY)
+    return cast(Array, jax.random.wrap_key_data(data[:2], impl=_THREEFRY))

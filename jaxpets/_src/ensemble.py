@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -82,12 +82,17 @@ def delta_space() -> ModelSpace:
     >>> space.next_obs(obs, space.target(obs, next_obs)).tolist()
     [1.0, 1.0, 1.0]
     """
-    return ModelSpace(
-        features=lambda obs: obs,
-        target=lambda obs, next_obs: next_obs - obs,
-        next_obs=lambda obs, target: obs + target,
-        bound=jnp.clip,
-    )
+
+    def features(obs: Array) -> Array:
+        return obs
+
+    def target(obs: Array, next_obs: Array) -> Array:
+        return next_obs - obs
+
+    def next_obs(obs: Array, target: Array) -> Array:
+        return obs + target
+
+    return ModelSpace(features, target, next_obs, bound=jnp.clip)
 
 
 def ensemble(
@@ -124,13 +129,14 @@ def ensemble(
     input_size = feature_size + action_size
     decays = layer_decays(config)
     network = Network(config.hidden_sizes, 2 * obs_size, config.precision)
-    apply_members: Callable[[Any, Array], Array] = jax.vmap(network.apply)  # pyright: ignore
+    init_member = cast(Callable[[Array, Array], Any], network.init)
+    apply_members = jax.vmap(cast(Callable[[Any, Array], Array], network.apply))
 
     def init(key: Array) -> EnsembleParams:
         check_key("key", key)
         keys = jax.random.split(key, config.num_members)
         example = jnp.zeros((1, input_size), jnp.float32)
-        members = jax.vmap(network.init, (0, None))(keys, example)
+        members = jax.vmap(init_member, (0, None))(keys, example)
         zeros = jnp.zeros((obs_size,), jnp.float32)
         inputs = jnp.zeros((input_size,), jnp.float32)
         scaler = Scaler(inputs, inputs + 1.0, zeros - jnp.inf, zeros + jnp.inf)

@@ -3,7 +3,14 @@
 import dataclasses
 from typing import Any
 
-from jaxpets._src.checks import check_count, check_counts, check_real, check_reals
+from jaxpets._src.checks import (
+    check_count,
+    check_counts,
+    check_real,
+    check_reals,
+    check_record,
+    is_sequence,
+)
 from jaxpets._src.network import Precision
 
 
@@ -38,8 +45,7 @@ class EnsembleConfig:
         check_counts("hidden_sizes", self.hidden_sizes)
         _check_decays(self.weight_decays, len(self.hidden_sizes) + 1)
         check_real("bound_decay", self.bound_decay, 0.0)
-        if not isinstance(self.precision, Precision):
-            raise TypeError(f"precision must be a Precision, got {self.precision!r}.")
+        check_record("precision", self.precision, Precision)
         if self.state_margin is not None:
             check_real("state_margin", self.state_margin, 0.0)
 
@@ -47,7 +53,7 @@ class EnsembleConfig:
 def _check_decays(decays: Any, num_layers: int) -> None:
     if decays is None:
         return
-    if not isinstance(decays, (tuple, list)):
+    if not is_sequence(decays):
         check_real("weight_decays", decays, 0.0)
         return
     check_reals("weight_decays", decays, 0.0)

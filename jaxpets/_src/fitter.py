@@ -1,8 +1,9 @@
 """Training of the ensemble: bootstraps, epochs and minibatches in one program."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -101,13 +102,13 @@ class _Batch(NamedTuple):
     inputs: Array  # [E, batch_size, F + A]
     targets: Array  # [E, batch_size, D]
     weight: Array  # [batch_size], sums to one; 0 past the end of the data
-    count: Array  # [] rows that count
+    num_rows: Array  # [] rows that count
 
 
 class _Totals(NamedTuple):
     nll: Array  # [] sum over rows
     mse: Array  # [] sum over rows
-    count: Array  # [] rows
+    num_rows: Array  # [] rows
 
 
 class _Progress(NamedTuple):
@@ -148,12 +149,7 @@ def fitter(
     """
     check_record("ensemble", ensemble, Ensemble)
     check_record("config", config, FitConfig)
-    if not isinstance(optimizer, optax.GradientTransformation):
-        kind = type(optimizer).__name__
-        raise TypeError(
-            f"optimizer must be of optax, as optax.adam(1e-3), got {optimizer!r} "
-            f"({kind})."
-        )
+    _check_optimizer(optimizer)
 
     def init(params: EnsembleParams) -> FitState:
         check_record("params", params, EnsembleParams)
@@ -170,19 +166,21 @@ def fitter(
             updates, new_opt_state = optimizer.update(grads, opt_state, network)
             if config.final_rate < 1.0:
                 rate = optax.cosine_decay_schedule(1.0, 1, config.final_rate)(done)
-                updates = jax.tree.map(lambda x: rate * x, updates)
+                updates = jax.tree.map(functools.partial(jnp.multiply, rate), updates)
         new_network = ensemble.project(optax.apply_updates(network, updates))
 
-        has_rows = batch.count > 0.0
+        has_rows = batch.num_rows > 0.0
         finite = _all_finite(ensemble.sentinels(grads), nll)
         good = has_rows & finite
         network, opt_state = _where(
             good, (new_network, new_opt_state), (network, opt_state)
         )
         mean = _Totals(nll, mse, jnp.ones_like(nll))
-        totals = jax.tree.map(
-            lambda total, x: total + jnp.where(good, batch.count * x, 0.0), totals, mean
-        )
+
+        def add(total: Array, x: Array) -> Array:
+            return total + jnp.where(good, batch.num_rows * x, 0.0)
+
+        totals = jax.tree.map(add, totals, mean)
         num_skipped += (has_rows & jnp.logical_not(finite)).astype(jnp.int32)
         return _Progress(network, opt_state, num_skipped, totals)
 
@@ -201,7 +199,9 @@ def fitter(
         rows = _bootstrap(rows_key, config, shape, size)
         num_batches = (size + config.batch_size - 1) // config.batch_size
 
-        def epoch(progress: _Progress, number_and_key: tuple) -> tuple[_Progress, None]:
+        def epoch(
+            progress: _Progress, number_and_key: tuple[Array, Array]
+        ) -> tuple[_Progress, None]:
             number, key = number_and_key
             shuffled = _shuffle(key, rows, size)
 
@@ -219,14 +219,23 @@ def fitter(
         keys = jax.random.split(epochs_key, config.num_epochs)
         end, _ = jax.lax.scan(epoch, start, (numbers, keys))
         metrics = FitMetrics(
-            nll=end.totals.nll / end.totals.count,
-            mse=end.totals.mse / end.totals.count,
+            nll=end.totals.nll / end.totals.num_rows,
+            mse=end.totals.mse / end.totals.num_rows,
             num_updates=(num_batches * config.num_epochs).astype(jnp.int32),
             num_skipped=end.num_skipped,
         )
         return EnsembleParams(end.network, scaler), FitState(end.opt_state), metrics
 
     return Fitter(init, step)
+
+
+def _check_optimizer(optimizer: Any) -> None:
+    if not isinstance(optimizer, optax.GradientTransformation):
+        kind = type(optimizer).__name__
+        raise TypeError(
+            f"optimizer must be of optax, as optax.adam(1e-3), got {optimizer!r} "
+            f"({kind})."
+        )
 
 
 def _bootstrap(
@@ -254,10 +263,10 @@ def _minibatch(
     within = jnp.minimum(position, size - 1)
     picked = jnp.take(rows, within, axis=1, mode="clip")
     used = (position < size).astype(jnp.float32)
-    count = jnp.float32(jnp.clip(size - i * batch_size, 0, batch_size))
+    num_rows = jnp.float32(jnp.clip(size - i * batch_size, 0, batch_size))
     inputs, targets = data
-    weight = used / jnp.maximum(count, 1.0)
-    return _Batch(inputs[picked], targets[picked], weight, count)
+    weight = used / jnp.maximum(num_rows, 1.0)
+    return _Batch(inputs[picked], targets[picked], weight, num_rows)
 
 
 def _loop(
@@ -269,10 +278,10 @@ def _loop(
         def one(j: Array, progress: _Progress) -> _Progress:
             return body(i * _UPDATES_AT_ONCE + j, progress)
 
-        return jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, progress)
+        return cast(_Progress, jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, progress))
 
     num_turns = (length + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
-    return jax.lax.fori_loop(0, num_turns, turn, progress)
+    return cast(_Progress, jax.lax.fori_loop(0, num_turns, turn, progress))
 
 
 def _zeros() -> _Totals:
@@ -285,4 +294,4 @@ def _all_finite(*trees: Any) -> Array:
 
 
 def _where(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    return jax.tree.map(functools.partial(jnp.where, condition), new, old)

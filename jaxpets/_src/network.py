@@ -2,7 +2,7 @@
 
 import enum
 import functools
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -49,7 +49,7 @@ def _swish(x: Array) -> Array:
         return 0.5 * x * jnp.tanh(0.5 * x) + 0.5 * x
 
     # The same function; XLA has a faster tanh than sigmoid for CPUs.
-    return jax.lax.platform_dependent(x, cpu=by_tanh, default=nn.swish)
+    return cast(Array, jax.lax.platform_dependent(x, cpu=by_tanh, default=nn.swish))
 
 
 def _dot_general(
@@ -78,4 +78,4 @@ def _dot_general(
     # bfloat16 they are half the traffic, a fifth of a plan's time on an H200. XLA for
     # CPUs, however, multiplies in float32 what is to be written as bfloat16.
     half = functools.partial(product, jnp.bfloat16)
-    return jax.lax.platform_dependent(lhs, rhs, cpu=full, default=half)
+    return cast(Array, jax.lax.platform_dependent(lhs, rhs, cpu=full, default=half))

@@ -68,11 +68,19 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
 
 def _only(tree: Any) -> Any:
     """Drops the axis of the seeds; what they share has none."""
-    return jax.tree.map(lambda x: x[0] if x.ndim else x, tree)
+
+    def only(x: Array) -> Array:
+        return x[0] if x.ndim else x
+
+    return jax.tree.map(only, tree)
 
 
 def _many(tree: Any) -> Any:
-    return jax.tree.map(lambda x: x[None], tree)
+
+    def many(x: Array) -> Array:
+        return x[None]
+
+    return jax.tree.map(many, tree)
 
 
 def _as_one_of_many(state: LearnerState) -> LearnerState:

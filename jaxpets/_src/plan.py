@@ -156,8 +156,8 @@ def random_planner(action_low: ArrayLike, action_high: ArrayLike) -> Planner:
     box = action_box(action_low, action_high)
 
     def step(
-        params: PlanParams, key: Array, state: tuple, obs: Any
-    ) -> tuple[PlanOutput, tuple]:
+        params: PlanParams, key: Array, state: tuple[()], obs: Any
+    ) -> tuple[PlanOutput, tuple[()]]:
         del params, obs
         check_key("key", key)
         uniform = jax.random.uniform(key, box.low.shape, jnp.float32)

@@ -1,6 +1,6 @@
 """One plan over several devices: each of them imagines a part of the candidates."""
 
-from typing import Any
+from typing import Any, cast
 
 import jax
 from jax import Array
@@ -36,7 +36,7 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
 
     >>> import jax.numpy as jnp
     >>> from jax.sharding import Mesh, PartitionSpec
-    >>> from jaxpets import cem
+    >>> from jaxpets.optimizers import cem
     >>> one, mesh = jnp.ones(1), Mesh(jax.devices(), "device")
     >>> search = sharded(cem(horizon=3, action_low=-one, action_high=one), "device")
     >>> objective = lambda key, actions: -jnp.sum((actions - 0.5) ** 2, (1, 2))
@@ -62,7 +62,7 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
             size = num_samples // num_devices
             own = jax.lax.dynamic_slice_in_dim(actions, index * size, size)
             values = objective_fn(jax.random.fold_in(key, index), own)
-            return jax.lax.all_gather(values, axis_name, tiled=True)
+            return cast(Array, jax.lax.all_gather(values, axis_name, tiled=True))
 
         return optimizer.step(objective, key, state)
 

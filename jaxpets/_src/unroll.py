@@ -99,7 +99,9 @@ def unroll(
     check_record("state", state, UnrollState)
     check_count("length", length)
 
-    def tick(state: UnrollState, _: None) -> tuple[UnrollState, tuple]:
+    def tick(
+        state: UnrollState, _: None
+    ) -> tuple[UnrollState, tuple[Transition, PlanOutput]]:
         plan_key = jax.random.fold_in(key, state.step)
         output, planner_state = planner.step(
             params, plan_key, state.planner, observe_fn(state.env)

@@ -48,7 +48,7 @@ def from_brax(env: BraxEnv) -> Env:
             shape = jax.tree.map(jnp.shape, state.obs)
             raise ValueError(f"env must observe one vector, got {shape}.")
         # Brax mixes weak types into its state, which would trace every step twice.
-        state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
+        state = jax.tree.map(_strong, state)
         return EnvState(state.obs.astype(jnp.float32), state)
 
     def reset(key: Array) -> EnvState:
@@ -60,6 +60,10 @@ def from_brax(env: BraxEnv) -> Env:
             return wrap(env.step(state.physics, action))
 
     return Env(reset, step, action_low=-one, action_high=one)
+
+
+def _strong(x: Any) -> Array:
+    return jnp.asarray(x, jnp.result_type(x))
 
 
 def env_rollout(env: Env) -> RolloutFn:

@@ -9,7 +9,7 @@ import contextlib
 import importlib.resources
 import io
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 from xml.etree import ElementTree
 
 import jax
@@ -82,7 +82,8 @@ def task(name: str) -> TaskWeights:
     """
     if name not in TASK_NAMES:
         raise ValueError(f"task must be one of {', '.join(TASK_NAMES)}, got {name!r}.")
-    return jax.tree.map(lambda weight: weight[TASK_NAMES.index(name)], tasks())
+    index = TASK_NAMES.index(name)
+    return TaskWeights(*(weight[index] for weight in tasks()))
 
 
 def task_reward(
@@ -131,12 +132,13 @@ def model_space() -> ModelSpace:
         low = jnp.where(bounded, low, -jnp.inf)
         return jnp.clip(obs, low, jnp.where(bounded, high, jnp.inf))
 
-    return ModelSpace(
-        features=features,
-        target=lambda obs, next_obs: next_obs - relative * obs,
-        next_obs=lambda obs, target: relative * obs + target,
-        bound=bound,
-    )
+    def target(obs: Array, next_obs: Array) -> Array:
+        return next_obs - relative * obs
+
+    def next_obs(obs: Array, target: Array) -> Array:
+        return relative * obs + target
+
+    return ModelSpace(features, target, next_obs, bound)
 
 
 def load_model() -> Any:
@@ -151,7 +153,8 @@ def load_model() -> Any:
         compiler.attrib.pop(name, None)
     geom.set("density", _DENSITY)
     xml = ElementTree.tostring(root, "unicode")
-    return mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
+    c: Any = mujoco  # its names are made at import, where pyright does not see them
+    return c.MjModel.from_xml_string(xml)
 
 
 def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
@@ -179,9 +182,13 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     host_model.opt.ls_iterations = ls_iterations
     model = mjx.put_model(host_model, impl="jax")
     template = mjx.make_data(host_model, impl="jax")
+    mjx_step = cast(Callable[[Any, Any], Any], mjx.step)
+
+    def substep(_: Array, data: Any) -> Any:
+        return mjx_step(model, data)
 
     def advance(before: Physics, action: Array) -> Physics:
-        data = template.replace(
+        data: Any = template.replace(
             qpos=before.qpos,
             qvel=before.qvel,
             qacc_warmstart=before.qacc_warmstart,
@@ -193,9 +200,7 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
             jax.default_matmul_precision("highest"),
             jax.numpy_dtype_promotion("standard"),
         ):
-            data = jax.lax.fori_loop(
-                0, _FRAME_SKIP, lambda _, data: mjx.step(model, data), data
-            )
+            data = cast(Any, jax.lax.fori_loop(0, _FRAME_SKIP, substep, data))
         return Physics(data.qpos, data.qvel, data.qacc_warmstart)
 
     return _env(host_model, advance)
