@@ -45,6 +45,7 @@ LAYERS = {
     "_src.fused_rollout": 5,
     "_src.learner": 6,
     "_src.over_seeds": 7,
+    "envs.extra": 0,
     "envs.native": 1,
     "envs.half_cheetah": 2,
     "envs.adapters": 2,

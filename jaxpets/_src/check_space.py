@@ -13,9 +13,10 @@ def check_space(
 ) -> None:
     """Raises unless a model can be learned in these coordinates.
 
-    Tries the law `next_obs(o, target(o, x)) == x`, and that features and targets are
-    finite and of the right shape. A space that breaks the law trains as well as any
-    other and predicts nonsense. Call it once, on real transitions, outside `jit`.
+    Tries the law `next_obs(o, target(o, x)) == x`, that features and targets are finite
+    and that all results have the right shape. A space that breaks the law trains as
+    well as any other and predicts nonsense. Call it once, on real transitions, outside
+    `jit`.
 
     Args:
       space: what to try.
@@ -34,10 +35,16 @@ def check_space(
     check_array("space.features's result", features, [num_rows, "F"])
     check_array("space.target's result", target, [num_rows, obs_size])
     for name, value in (("features", features), ("target", target)):
-        if not np.isfinite(value).all():
-            raise ValueError(f"space.{name} must return finite numbers.")
+        finite = np.isfinite(value).all(axis=0)
+        if not finite.all():
+            entry = int(np.argmin(finite))
+            raise ValueError(
+                f"space.{name} must return finite numbers, but entry {entry} is not."
+            )
     rebuilt = space.next_obs(obs, target)
     check_array("space.next_obs's result", rebuilt, [num_rows, obs_size])
+    bounded = space.bound(next_obs, obs[0], obs[0])
+    check_array("space.bound's result", bounded, [num_rows, obs_size])
     error = np.abs(np.asarray(rebuilt) - np.asarray(next_obs)).max(axis=0)
     scale = np.maximum(np.abs(next_obs).max(axis=0), 1.0)
     worst = int(np.argmax(error / scale))

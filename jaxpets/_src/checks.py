@@ -136,13 +136,24 @@ def check_array(name: str, value: Any, shape: Sequence[int | str | None]) -> Non
 
 def check_key(name: str, key: Any) -> None:
     """Raises unless `key` is one typed key, as `jax.random.key` makes it."""
-    dtype = getattr(key, "dtype", None)
-    if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
-        raise TypeError(
-            f"{name} must be a typed key from jax.random.key, got {dtype or key!r}."
-        )
+    _check_typed(name, key, "a typed key")
     if key.shape != ():
         raise ValueError(
             f"{name} must be a single key, got a batch of shape {key.shape}; "
             "use jax.vmap to map over keys."
+        )
+
+
+def check_keys(name: str, keys: Any, count: int) -> None:
+    """Raises unless `keys` are typed keys whose leading axis is `count`."""
+    _check_typed(name, keys, "typed keys")
+    if keys.shape[:1] != (count,):
+        raise ValueError(f"{name} must be {count} keys, got shape {keys.shape}.")
+
+
+def _check_typed(name: str, key: Any, wanted: str) -> None:
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        raise TypeError(
+            f"{name} must be {wanted} from jax.random.key, got {dtype or key!r}."
         )

@@ -84,6 +84,7 @@ def grow(dataset: Dataset, capacity: int) -> Dataset:
     Raises:
       TypeError, ValueError: if capacity is no integer, or smaller than it was.
     """
+    check_record("dataset", dataset, Dataset)
     old = dataset.data.obs.shape[0]
     check_count("capacity", capacity, minimum=old)
 
@@ -103,5 +104,6 @@ def obs_variance(dataset: Dataset) -> Array:
     1 where there is none, as before any data. As the baseline variance of an
     exploration reward it counts disagreement in units of what was seen.
     """
+    check_record("dataset", dataset, Dataset)
     _, std = moments(dataset.data.obs, dataset.size)
     return std**2

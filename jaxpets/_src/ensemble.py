@@ -142,7 +142,7 @@ def ensemble(
         scaler = Scaler(inputs, inputs + 1.0, zeros - jnp.inf, zeros + jnp.inf)
         return EnsembleParams(NetworkParams(members, zeros - 10.0, zeros + 0.5), scaler)
 
-    check_params = _params_check(init)
+    check_params = params_check(init)
 
     def forward(network: NetworkParams, inputs: Array) -> tuple[Array, Array]:
         outputs = apply_members(network.members, inputs)
@@ -227,7 +227,7 @@ def ensemble(
     )
 
 
-def _params_check(
+def params_check(
     init: Callable[[Array], EnsembleParams],
 ) -> Callable[[EnsembleParams], None]:
     """Returns a check that parameters have the structure and shapes of `init`'s."""

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.checks import check_record
 from jaxpets._src.ensemble_config import EnsembleConfig
 
 
@@ -53,6 +54,7 @@ class EnsembleParams(NamedTuple):
 
 def max_variance(params: EnsembleParams) -> Array:
     """Returns `exp(max_logvar)` `[D]` in units of obs squared: the paper's w_base."""
+    check_record("params", params, EnsembleParams)
     return jnp.exp(params.network.max_logvar)
 
 

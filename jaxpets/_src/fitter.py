@@ -14,10 +14,11 @@ from jaxpets._src.checks import (
     check_count,
     check_flag,
     check_key,
+    check_like,
     check_real,
     check_record,
 )
-from jaxpets._src.ensemble import Ensemble
+from jaxpets._src.ensemble import Ensemble, params_check
 from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.types import Dataset
 
@@ -145,14 +146,16 @@ def fitter(
       A Fitter.
 
     Raises:
-      TypeError: if an argument is not what it should be.
+      TypeError: if an argument is not what it should be; from the functions, when
+        traced, TypeError or ValueError.
     """
     check_record("ensemble", ensemble, Ensemble)
     check_record("config", config, FitConfig)
     _check_optimizer(optimizer)
+    check_params = params_check(ensemble.init)
 
     def init(params: EnsembleParams) -> FitState:
-        check_record("params", params, EnsembleParams)
+        check_params(params)
         return FitState(optimizer.init(params.network))
 
     def update(progress: _Progress, batch: _Batch, done: Array) -> _Progress:
@@ -187,9 +190,10 @@ def fitter(
     def step(
         params: EnsembleParams, key: Array, state: FitState, dataset: Dataset
     ) -> tuple[EnsembleParams, FitState, FitMetrics]:
-        check_record("params", params, EnsembleParams)
+        check_params(params)
         check_key("key", key)
         check_record("state", state, FitState)
+        check_like("state", state, jax.eval_shape(init, params))
         check_record("dataset", dataset, Dataset)
         size = dataset.size
         scaler = ensemble.fit_scaler(dataset.data, size)

@@ -1,5 +1,6 @@
 """One trial of model-based reinforcement learning as one pure function."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -7,6 +8,7 @@ import jax
 from jax import Array
 
 from jaxpets._src import dataset as datasets
+from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import check_count, check_key, check_like, check_record
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams
@@ -14,13 +16,12 @@ from jaxpets._src.fitter import FitMetrics, FitState, Fitter
 from jaxpets._src.types import (
     Dataset,
     Env,
-    EnvState,
     Planner,
     PlanOutput,
     PlanParams,
     Transition,
 )
-from jaxpets._src.unroll import start_trial, unroll
+from jaxpets._src.unroll import reset, start_trial, unroll
 
 
 class RewardData(NamedTuple):
@@ -125,9 +126,9 @@ def learner(
     check_record("reward_data", reward_data, RewardData)
     check_count("trial_length", trial_length)
     check_count("capacity", capacity, minimum=trial_length)
-    begin = jax.eval_shape(env.reset, jax.random.key(0))
-    check_record("env.reset's result", begin, EnvState)
-    sizes = (begin.obs.shape[-1], env.action_low.shape[0])
+    box = action_box(env.action_low, env.action_high)
+    start = jax.eval_shape(functools.partial(reset, env), jax.random.key(0))
+    sizes = (start.obs.shape[0], box.low.shape[0])
     if sizes != (ensemble.obs_size, ensemble.action_size):
         raise ValueError(
             f"ensemble must have the sizes of env, obs_size {sizes[0]} and action_size "
@@ -145,6 +146,7 @@ def learner(
     def learn(
         key: Array, state: LearnerState, transitions: Transition
     ) -> tuple[LearnerState, FitMetrics]:
+        check_key("key", key)
         check_record("state", state, LearnerState)
         dataset = datasets.append(state.dataset, transitions)
         params, fit, metrics = fitter.step(state.params, key, state.fit, dataset)

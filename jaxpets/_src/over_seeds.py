@@ -6,7 +6,7 @@ import jax
 from jax import Array
 
 from jaxpets._src import dataset as datasets
-from jaxpets._src.checks import check_count, check_record
+from jaxpets._src.checks import check_count, check_keys, check_record
 from jaxpets._src.fitter import FitMetrics
 from jaxpets._src.learner import Learner, LearnerState, TrialOutput
 from jaxpets._src.types import Planner, Transition
@@ -35,17 +35,20 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
       of one seed.
 
     Raises:
-      TypeError, ValueError: unless num_seeds is a positive Python integer.
+      TypeError, ValueError: unless num_seeds is a positive Python integer; from the
+        functions, unless there are as many keys.
     """
     check_record("learner", learner, Learner)
     check_count("num_seeds", num_seeds)
 
     def init(keys: Array) -> LearnerState:
+        check_keys("keys", keys, num_seeds)
         return jax.vmap(learner.init, out_axes=SEED_AXES)(keys)
 
     def learn(
         keys: Array, state: LearnerState, transitions: Transition
     ) -> tuple[LearnerState, FitMetrics]:
+        check_keys("keys", keys, num_seeds)
         if num_seeds == 1:
             state, metrics = learner.learn(keys[0], _only(state), _only(transitions))
             return _as_one_of_many(state), _many(metrics)
@@ -55,6 +58,8 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
     def step(
         planner: Planner, keys: Array, state: LearnerState
     ) -> tuple[LearnerState, TrialOutput]:
+        check_keys("keys", keys, num_seeds)
+
         def one(key: Array, state: LearnerState) -> tuple[LearnerState, TrialOutput]:
             return learner.step(planner, key, state)
 

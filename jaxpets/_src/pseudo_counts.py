@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count, check_key
+from jaxpets._src.checks import check_array, check_count, check_key, check_record
 from jaxpets._src.moments import moments
 from jaxpets._src.types import Dataset
 
@@ -68,6 +68,7 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
     Raises:
       ValueError: if the projection does not fit the observations or has over 32 rows.
     """
+    check_record("dataset", dataset, Dataset)
     obs = dataset.data.next_obs
     check_array("projection", projection, ["k", obs.shape[1]])
     if projection.shape[0] > _MAX_BITS:
@@ -96,6 +97,7 @@ def lookup(counts: PseudoCounts, obs: Array) -> Array:
     Returns:
       `[...]` int32.
     """
+    check_record("counts", counts, PseudoCounts)
     check_array("obs", obs, ["...", counts.mean.shape[0]])
     code = _hash(counts.projection, counts.mean, counts.std, obs)
     # Unrolled, the steps of the search can be one program. Every particle of every

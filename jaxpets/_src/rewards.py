@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_real
+from jaxpets._src.checks import check_array, check_callable, check_real
 from jaxpets._src.types import RewardFn
 
 
@@ -76,6 +76,7 @@ def one_step_disagreement(
     Returns:
       A RewardFn that returns `[E, P]` and whose params are those of predict_fn.
     """
+    check_callable("predict_fn", predict_fn)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         del next_obs
@@ -112,6 +113,7 @@ def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
     Raises:
       TypeError, ValueError: unless caution is a finite number of at least 0.
     """
+    check_callable("reward_fn", reward_fn)
     check_real("caution", caution, 0.0)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:

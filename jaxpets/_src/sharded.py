@@ -5,6 +5,7 @@ from typing import Any, cast
 import jax
 from jax import Array
 
+from jaxpets._src.checks import check_key, check_record
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
 
 
@@ -31,6 +32,7 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
       A TrajectoryOptimizer with the state of `optimizer`.
 
     Raises:
+      TypeError: if optimizer is no TrajectoryOptimizer.
       ValueError: from `step`, when traced, if N is not a multiple of the axis' size.
       NameError: from `step`, when traced, if no axis has that name.
 
@@ -47,8 +49,10 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
     >>> bool(jnp.all(jnp.abs(solution.actions - 0.5) < 0.05))
     True
     """
+    check_record("optimizer", optimizer, TrajectoryOptimizer)
 
     def step(objective_fn: ObjectiveFn, key: Array, state: Any) -> tuple[Solution, Any]:
+        check_key("key", key)
         num_devices = jax.lax.axis_size(axis_name)
         index = jax.lax.axis_index(axis_name)
 

@@ -9,6 +9,7 @@ from jax import Array
 
 from jaxpets._src.checks import (
     check_array,
+    check_callable,
     check_count,
     check_key,
     check_like,
@@ -56,10 +57,15 @@ def start_trial(env: Env, planner: Planner, key: Array) -> UnrollState:
     check_record("env", env, Env)
     check_record("planner", planner, Planner)
     check_key("key", key)
+    return UnrollState(reset(env, key), planner.init(), jnp.zeros((), jnp.int32))
+
+
+def reset(env: Env, key: Array) -> EnvState:
+    """Returns what `env.reset` does, if that is an EnvState."""
     state = env.reset(key)
     check_record("env.reset's result", state, EnvState)
     check_array("env.reset's result.obs", state.obs, ["D"])
-    return UnrollState(state, planner.init(), jnp.zeros((), jnp.int32))
+    return state
 
 
 def unroll(
@@ -94,10 +100,13 @@ def unroll(
       TypeError, ValueError: if an argument is not what it should be, or env.step
         returns another structure, shape or dtype than it takes.
     """
+    check_record("env", env, Env)
+    check_record("planner", planner, Planner)
     check_record("params", params, PlanParams)
     check_key("key", key)
     check_record("state", state, UnrollState)
     check_count("length", length)
+    check_callable("observe_fn", observe_fn)
 
     def tick(
         state: UnrollState, _: None

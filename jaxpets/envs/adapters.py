@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.checks import check_key, check_record
 from jaxpets._src.types import Env, EnvState, RolloutFn
 
 
@@ -52,6 +53,7 @@ def from_brax(env: BraxEnv) -> Env:
         return EnvState(state.obs.astype(jnp.float32), state)
 
     def reset(key: Array) -> EnvState:
+        check_key("key", key)
         with jax.numpy_dtype_promotion("standard"):
             return wrap(env.reset(jax.random.key_data(key)))
 
@@ -77,10 +79,16 @@ def env_rollout(env: Env) -> RolloutFn:
 
     Returns:
       A RolloutFn with one member and one particle, `[N, H+1, 1, 1, D]`.
+
+    Raises:
+      TypeError: if env is no Env; from the rollout, if its start is no EnvState.
     """
+    check_record("env", env, Env)
 
     def rollout(params: Any, key: Array, obs: EnvState, actions: Array) -> Array:
-        del params, key
+        check_key("key", key)
+        check_record("obs", obs, EnvState)
+        del params
 
         def imagine(sequence: Array) -> Array:
             def step(state: EnvState, action: Array) -> tuple[EnvState, Array]:

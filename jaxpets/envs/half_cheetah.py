@@ -14,12 +14,15 @@ from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count
+from jaxpets._src.checks import check_array, check_count, check_key, check_record
 from jaxpets._src.types import Env, EnvState, ModelSpace
+from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.native import native_physics
+
+with needs_extra():
+    import mujoco
 
 OBS_SIZE = 18
 ACTION_SIZE = 6
@@ -43,19 +46,31 @@ _DENSITY = "660.8849500774735"
 
 
 class Physics(NamedTuple):
-    """The part of MuJoCo's state from which the rest follows."""
+    """The part of MuJoCo's state from which the rest follows.
 
-    qpos: Array  # [9]
-    qvel: Array  # [9]
-    qacc_warmstart: Array  # [9], where the contact solver starts
+    Attributes:
+      qpos: `[9]`, positions in m and rad.
+      qvel: `[9]`, velocities in m/s and rad/s.
+      qacc_warmstart: `[9]`, where the contact solver starts.
+    """
+
+    qpos: Array
+    qvel: Array
+    qacc_warmstart: Array
 
 
 class TaskWeights(NamedTuple):
-    """A task as data: `velocity * v + pitch_rate * omega - control * ||a||^2`."""
+    """A task as data: `velocity * v + pitch_rate * omega - control * ||a||^2`.
 
-    velocity: Array  # []
-    pitch_rate: Array  # []
-    control: Array  # []
+    Attributes:
+      velocity: `[]`, weight of the forward velocity.
+      pitch_rate: `[]`, weight of the pitch rate.
+      control: `[]`, weight of the action's cost.
+    """
+
+    velocity: Array
+    pitch_rate: Array
+    control: Array
 
 
 TASK_NAMES = ("forward", "backward", "front-flip", "back-flip")
@@ -101,6 +116,7 @@ def task_reward(
       `[...]`, in m/s or rad/s.
     """
     del obs
+    check_record("weights", weights, TaskWeights)
     check_array("next_obs", next_obs, ["...", OBS_SIZE])
     motion = (
         weights.velocity * next_obs[..., FORWARD_VELOCITY]
@@ -144,7 +160,8 @@ def model_space() -> ModelSpace:
 def load_model() -> Any:
     """Returns gymnasium's HalfCheetah as a compiled MuJoCo model."""
     # By way of the package: its module of MuJoCo environments imports a renderer.
-    assets = importlib.resources.files("gymnasium") / "envs/mujoco/assets"
+    with needs_extra():
+        assets = importlib.resources.files("gymnasium") / "envs/mujoco/assets"
     root = ElementTree.fromstring((assets / "half_cheetah.xml").read_text())
     compiler, geom = root.find("compiler"), root.find("default/geom")
     assert compiler is not None and geom is not None
@@ -174,7 +191,7 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     check_count("iterations", iterations)
     check_count("ls_iterations", ls_iterations)
     # MJX writes to stdout when it finds no warp, which it does not need here.
-    with contextlib.redirect_stdout(io.StringIO()):
+    with needs_extra(), contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
 
     host_model = load_model()
@@ -244,6 +261,7 @@ def _env(model: Any, advance: Callable[[Physics, Array], Physics]) -> Env:
         return jnp.concatenate([velocity[None], physics.qpos[1:], physics.qvel])
 
     def reset(key: Array) -> EnvState:
+        check_key("key", key)
         qpos_key, qvel_key = jax.random.split(key)
         physics = Physics(
             qpos=qpos0 + _RESET_STD * jax.random.normal(qpos_key, (9,), jnp.float32),

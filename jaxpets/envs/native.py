@@ -8,11 +8,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
 
 from jaxpets._src.checks import check_count
+from jaxpets.envs.extra import needs_extra
+
+with needs_extra():
+    import mujoco
 
 # `(qpos, qvel, qacc_warmstart, ctrl) -> (qpos, qvel, qacc_warmstart)`.
 PhysicsFn = Callable[[Array, Array, Array, Array], tuple[Array, Array, Array]]

@@ -263,7 +263,7 @@ def test_delta_space_obeys_its_law():
         (
             dict(precision="bf16"),
             TypeError,
-            "precision must be a Precision, got 'bf16'",
+            "precision must be a Precision, got str",
         ),
         (dict(state_margin=-1.0), ValueError, "state_margin must be finite"),
     ],

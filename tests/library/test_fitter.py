@@ -13,28 +13,6 @@ from jaxpets import FitConfig
 CAPACITY = 40
 
 
-@pytest.fixture(scope="module")
-def model():
-    return toys.small_ensemble()
-
-
-@pytest.fixture(scope="module")
-def params(model):
-    return jax.jit(model.init)(jax.random.key(0))
-
-
-@pytest.fixture(scope="module")
-def fitter(model):
-    return jaxpets.fitter(
-        model, optax.adam(1e-3), FitConfig(num_epochs=3, batch_size=8)
-    )
-
-
-@pytest.fixture(scope="module")
-def step(fitter):
-    return jax.jit(fitter.step)
-
-
 # -- which rows are shown ------------------------------------------------------------
 
 

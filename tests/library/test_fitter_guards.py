@@ -16,28 +16,6 @@ from jaxpets import FitConfig
 CAPACITY = 40
 
 
-@pytest.fixture(scope="module")
-def model():
-    return toys.small_ensemble()
-
-
-@pytest.fixture(scope="module")
-def params(model):
-    return jax.jit(model.init)(jax.random.key(0))
-
-
-@pytest.fixture(scope="module")
-def fitter(model):
-    return jaxpets.fitter(
-        model, optax.adam(1e-3), FitConfig(num_epochs=3, batch_size=8)
-    )
-
-
-@pytest.fixture(scope="module")
-def step(fitter):
-    return jax.jit(fitter.step)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_update_whose_loss_is_not_finite_is_dropped(
     model, params, step, fitter, bad

@@ -1,0 +1,157 @@
+"""Many seeds of a learner are the learners of the seeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import toys
+
+import jaxpets
+from jaxpets import FitConfig, RewardData
+
+ENV = toys.cart_env()
+MODEL = toys.small_ensemble(num_members=2, hidden_sizes=(4,), weight_decays=1e-4)
+LENGTH, CAPACITY = 4, 8
+CHANCE = jaxpets.random_planner(ENV.action_low, ENV.action_high)
+BASELINE = RewardData(
+    init=lambda key: jax.random.uniform(key, (2,), jnp.float32),
+    refresh=lambda data, params, dataset: jaxpets.rewards.max_variance(params),
+)
+# Mapped products round otherwise. Adam would divide that by gradients near zero; plain
+# descent leaves it as small as it is.
+CLOSE = dict(rtol=1e-4, atol=1e-6)
+
+
+def build(reward_data=BASELINE):
+    config = FitConfig(num_epochs=2, batch_size=4)
+    fitter = jaxpets.fitter(MODEL, optax.sgd(1e-2), config)
+    return jaxpets.learner(
+        ENV, MODEL, fitter, reward_data, trial_length=LENGTH, capacity=CAPACITY
+    )
+
+
+LEARNER = build()
+
+
+def keys_of(*axes):
+    """Four keys for every seed, stage first."""
+    return jnp.moveaxis(jax.random.split(jax.random.key(7), (*axes, 4)), -1, 0)
+
+
+def run(learner, keys):
+    """Two trials, and a third part of learning from transitions that were recorded."""
+    axes = keys.shape[1:]
+    state = learner.init(keys[0])
+    state, first = learner.step(CHANCE, keys[1], state)
+    state, second = learner.step(CHANCE, keys[2], state)
+    rows = toys.transitions(LENGTH)
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (*axes, *x.shape)), rows)
+    state, metrics = learner.learn(keys[3], state, rows)
+    return state, (first, second, metrics)
+
+
+@pytest.fixture(scope="module")
+def run_one():
+    return jax.jit(lambda keys: run(LEARNER, keys))
+
+
+def assert_seed_equals(many, index, one):
+    """The seed at `index` of many is that one, in everything that it has to itself."""
+    state, outputs = many
+    shared = state.dataset.size, state.dataset.cursor
+    assert [x.shape for x in shared] == [(), ()]
+    size, cursor = one[0].dataset.size, one[0].dataset.cursor
+    assert [int(x) for x in shared] == [int(size), int(cursor)]
+    own = (state.params, state.fit, state.dataset.data, state.reward, outputs)
+    want = (one[0].params, one[0].fit, one[0].dataset.data, one[0].reward, one[1])
+    got = jax.tree.map(lambda x: x[index], own)
+    toys.assert_trees_close(got, want, **CLOSE)
+
+
+@pytest.mark.parametrize("num_seeds", [1, 3])
+def test_many_seeds_are_a_loop_over_the_seeds(run_one, num_seeds):
+    keys = keys_of(num_seeds)
+    seeds = jaxpets.over_seeds(LEARNER, num_seeds)
+    got = jax.jit(lambda keys: run(seeds, keys))(keys)
+    for seed in range(num_seeds):
+        assert_seed_equals(got, seed, run_one(keys[:, seed]))
+
+
+@pytest.mark.parametrize(("outer", "inner"), [(2, 2), (1, 2), (2, 1)])
+def test_seeds_of_seeds_are_a_loop_over_both(run_one, outer, inner):
+    keys = keys_of(outer, inner)
+    nested = jaxpets.over_seeds(jaxpets.over_seeds(LEARNER, inner), outer)
+    got = jax.jit(lambda keys: run(nested, keys))(keys)
+    for index in np.ndindex(outer, inner):
+        assert_seed_equals(got, index, run_one(keys[:, *index]))
+
+
+def test_the_axes_of_a_state_are_the_public_ones():
+    seeds = jaxpets.over_seeds(LEARNER, 3)
+    many = jax.eval_shape(seeds.init, keys_of(3)[0])
+    one = jax.eval_shape(LEARNER.init, jax.random.key(0))
+    wanted = jaxpets.SEED_AXES
+    axes = jax.tree.broadcast(wanted, one, is_leaf=lambda axis: axis is None)
+    leaves = jax.tree.leaves(axes, is_leaf=lambda axis: axis is None)
+    every = zip(jax.tree.leaves(many), jax.tree.leaves(one), leaves, strict=True)
+    for got, alone, axis in every:
+        assert got.shape == (alone.shape if axis is None else (3, *alone.shape))
+
+
+def test_a_learner_may_have_no_reward_data():
+    learner = build(RewardData())
+    assert jax.eval_shape(learner.init, jax.random.key(0)).reward == ()
+    seeds = jaxpets.over_seeds(learner, 2)
+    assert jax.eval_shape(seeds.init, keys_of(2)[0]).reward == ()
+
+
+@pytest.mark.parametrize("num_seeds", [0, -1])
+def test_there_is_at_least_one_seed(num_seeds):
+    with pytest.raises(ValueError, match="num_seeds must be at least 1, got"):
+        jaxpets.over_seeds(LEARNER, num_seeds)
+
+
+@pytest.mark.parametrize("num_seeds", [2.0, None, jnp.int32(2), True])
+def test_the_number_of_seeds_is_an_integer(num_seeds):
+    with pytest.raises(TypeError, match="num_seeds must be a Python int, got"):
+        jaxpets.over_seeds(LEARNER, num_seeds)
+
+
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_there_are_as_many_keys_as_seeds(num_seeds):
+    seeds = jaxpets.over_seeds(LEARNER, num_seeds)
+    message = rf"keys must be {num_seeds} keys, got shape \(3,\)"
+    with pytest.raises(ValueError, match=message):
+        seeds.init(keys_of(3)[0])
+
+
+# -- buffers -------------------------------------------------------------------------
+
+
+def assert_every_leaf_is_a_buffer_of_its_own(tree):
+    leaves = [x for x in jax.tree.leaves(tree) if x.size]
+    assert len({x.unsafe_buffer_pointer() for x in leaves}) == len(leaves)
+
+
+@pytest.mark.parametrize("num_seeds", [None, 1, 2])
+def test_a_state_made_outside_of_jit_can_be_donated(num_seeds):
+    """Leaves that share a buffer fail: 'Attempt to donate the same buffer twice'."""
+    learner, keys = LEARNER, keys_of()
+    if num_seeds:
+        learner, keys = jaxpets.over_seeds(LEARNER, num_seeds), keys_of(num_seeds)
+    state = learner.init(keys[0])
+    assert_every_leaf_is_a_buffer_of_its_own(state)
+    step = jax.jit(
+        lambda key, state: learner.step(CHANCE, key, state), donate_argnums=1
+    )
+    after, _ = step(keys[1], state)
+    assert after.dataset.size == LENGTH
+
+
+def test_a_dataset_made_outside_of_jit_can_be_donated():
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
+    assert_every_leaf_is_a_buffer_of_its_own(dataset)
+    append = jax.jit(jaxpets.datasets.append, donate_argnums=0)
+    after = append(dataset, toys.transitions(LENGTH))
+    assert after.size == LENGTH and dataset.size.is_deleted()
