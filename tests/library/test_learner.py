@@ -180,22 +180,6 @@ def test_bad_settings_fail_when_built(key):
         LEARNER.init(jax.random.PRNGKey(0))
 
 
-def test_a_model_of_another_size_fails(key):
-    """An ensemble for three observations cannot learn an environment with two."""
-    model = toys.small_ensemble(obs_size=3)
-    fitter = jaxpets.fitter(model, optax.adam(1e-3), FitConfig())
-
-    def build_and_learn():
-        learner = jaxpets.learner(
-            ENV, model, fitter, BASELINE, trial_length=LENGTH, capacity=LENGTH
-        )
-        state = learner.init(key)
-        return learner.learn(key, state, toys.transitions(LENGTH))
-
-    with pytest.raises(ValueError, match=r"must be float32\[.*\], got float32\["):
-        jax.eval_shape(build_and_learn)
-
-
 def test_reward_data_that_change_shape_fail_when_traced(key):
     """They would retrace every trial, and fail to be restored."""
     growing = RewardData(
@@ -204,7 +188,7 @@ def test_reward_data_that_change_shape_fail_when_traced(key):
     )
     learner = build(growing)
     state = jax.eval_shape(learner.init, key)
-    with pytest.raises(AssertionError, match="shape"):
+    with pytest.raises(ValueError, match="refresh's result must be float32"):
         jax.eval_shape(
             lambda: learner.step(
                 CHANCE, key, INIT(key)._replace(reward=jnp.zeros(state.reward.shape))
