@@ -7,7 +7,9 @@ import pytest
 
 from experiments import cli
 from experiments.config import Config
-from experiments.errors import CheckpointError, OutOfMemoryError
+from experiments.entries import entries, flag
+from experiments.errors import OutOfMemoryError
+from experiments.flags import COMMANDS
 from experiments.presets import PRESETS
 from experiments.run import _plain_errors, main
 
@@ -45,48 +47,49 @@ def explored(out, name="smoke-epistemic", **changes):
     return path
 
 
-EPOCHS = ["--tuning.num-epochs 0", "1 to 10,000"]
-TRIALS = ["--num-trials", "1 to 100,000"]
-ELITES = ["--planner.num-elites", "9", "2 to --planner.num-samples (8)"]
 AT = ("--coordinator-address", "host:1")
 AUTO = (AT[0], "auto")
-RATE = ["--training.learning-rate", "1e-09 to 1.0"]
+LEFT_OUT = "left out in explore; it is for zero-shot and finetune"
 
 
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        ((), ["--phase", "explore,zero-shot,finetune,report"]),
-        (("--phase",), ["--phase"]),
-        (("--phase", "fly"), ["--phase", "'fly'", "'finetune'"]),
-        ((*SMOKE, "--preset", "huge"), ["--preset", "huge", "paper, laptop, smoke"]),
-        ((*SMOKE, "--preset"), ["--preset", "paper, laptop, smoke"]),
-        ((*SMOKE, "--arm", "x"), ["--arm", "'x'", "'one-step'"]),
-        ((*SMOKE, "--engine", "warp"), ["--engine", "'warp'", "'mujoco'"]),
-        ((*SMOKE, "--task", "swim"), ["--task", "'swim'", "'back-flip'"]),
-        ((*LATER, "--arm", "x"), ["--arm", "'x'", "'one-step'"]),
+        ((), ["--phase is missing", "explore, zero-shot, finetune, report"]),
+        (("--phase",), ["--phase with no value", "explore, zero-shot"]),
+        (("--phase", "fly"), ["--phase fly", "finetune"]),
+        (("fly", "--preset", "smoke"), ["--phase fly", "finetune"]),
+        ((*SMOKE, "--preset", "huge"), ["--preset huge", "laptop, paper, smoke"]),
+        ((*LATER, "--arm", "x"), ["--arm x", "one-step"]),
+        ((*LATER, "--task", "swim"), ["--task swim", "back-flip"]),
         ((*SMOKE, "--num-trails", "3"), ["--num-trails", "Perhaps", "--num-trials"]),
-        ((*SMOKE, "--num_trails", "3"), ["--num_trails", "Perhaps", "--num-trials"]),
+        ((*SMOKE, "--num_trails=3"), ["--num_trails is", "Perhaps", "--num-trials"]),
+        (("--phase", "report", "--num-trails", "3"), ["--num-trails is not a flag"]),
         ((*SMOKE, "extra"), ["extra"]),
-        *[((*SMOKE, "--num-trials", v), [v, *TRIALS]) for v in ("0", "-1", "100001")],
+        ((*SMOKE, "--debug=true"), ["true is not a flag"]),
         *[
-            ((*SMOKE, "--num-trials", v), [v, *TRIALS])
-            for v in ("abc", "nan", "inf", "1e9", "2.5")
+            ((*SMOKE, "--num-trials", value), [f"--num-trials {value}", "1 to 100,000"])
+            for value in ("0", "-1", "abc", "nan", "inf", "1e9", "2.5")
         ],
-        ((*SMOKE, "--num-trials"), TRIALS[:1]),
-        ((*SMOKE, "--tuning.num-epochs", "0"), EPOCHS),
-        ((*SMOKE, "--num_trials=0"), TRIALS),
+        ((*SMOKE, "--num-trials"), ["--num-trials with no value", "1 to 100,000"]),
+        ((*SMOKE, "--num_trials=0"), ["--num-trials 0", "1 to 100,000"]),
+        ((*SMOKE, "--training.learning-rate", "nan"), ["nan", "1e-09 to 1.0"]),
+        (
+            (*SMOKE, "--model.state-margin", "inf"),
+            ["inf", "0.0 to 1,000,000"],
+        ),
+        ((*SMOKE, "--tuning.num-epochs", "0"), ["--tuning.num-epochs", "1 to 10,000"]),
         ((*SMOKE, "--seeds"), ["--seeds", "one or more different"]),
-        ((*SMOKE, "--seeds", "-1"), ["--seeds", "-1", "0 to 4294967295"]),
-        ((*SMOKE, "--seeds", "4294967296"), ["--seeds 4294967296", "0 to 4294967295"]),
+        ((*SMOKE, "--seeds", "0", "-1"), ["--seeds 0 -1", "0 to 4,294,967,295"]),
         ((*SMOKE, "--seeds", "0", "0"), ["--seeds", "(0, 0)", "different"]),
-        ((*SMOKE, "--planner.num-elites", "9"), ELITES),
-        ((*SMOKE, "--planner.num-elites", "1"), [ELITES[0], "1", "2 to 1,000,000"]),
+        (
+            (*SMOKE, "--planner.num-elites", "9"),
+            ["--planner.num-elites 9", "2 to --planner.num-samples (8)"],
+        ),
         (
             (*SMOKE, "--task-planner.num-particles", "4"),
             ["--task-planner.num-particles 4", "multiple", "(3)"],
         ),
-        ((*SMOKE, "--planner.optimizer", "sgd"), ["--planner.optimizer", "'icem'"]),
         (
             (*SMOKE, "--model.num-members", "1"),
             ["--model.num-members 1", "2 or more for --arm epistemic"],
@@ -97,24 +100,17 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
         ),
         ((*SMOKE, "--random-trials", "4"), ["--random-trials 4", "--num-trials (3)"]),
         ((*SMOKE, "--chunk-length", "7"), ["--chunk-length 7", "divisor", "(20)"]),
-        ((*SMOKE, "--num-bits", "33"), ["--num-bits 33", "1 to 32"]),
-        *[
-            ((*SMOKE, "--training.learning-rate", v), [v, *RATE])
-            for v in ("0", "-1", "nan", "inf", "x")
-        ],
-        ((*SMOKE, "--model.state-margin", "nan"), ["--model.state-margin", "nan"]),
-        ((*SMOKE, "--model.state-margin", "inf"), ["--model.state-margin", "inf"]),
         *[
             ((*SMOKE, f"--name={name}"), ["--name", repr(name), "letters, digits"])
             for name in ("a/b", "..", ".", "", "-x", "/etc/x", "a\0b", "a ", "a\nb")
         ],
         ((*SMOKE, "--name", "a" * 300), ["--name", "aaa...", "at most 64"]),
         ((*LATER, "--name", "../x"), ["--name", "'../x'", "at most 64"]),
-        ((*SMOKE, "--video", "a.mp4"), ["--video a.mp4", "zero-shot or finetune"]),
-        ((*SMOKE, "--at-trial", "2"), ["--at-trial 2", "zero-shot and finetune"]),
-        ((*SMOKE, "--tag", "x"), ["--tag x", "zero-shot and finetune"]),
-        ((*SMOKE, "--task", "forward"), ["--task forward", "zero-shot and finetune"]),
-        ((*SMOKE, "--from", "there"), ["--from there", "zero-shot and finetune"]),
+        ((*SMOKE, "--video", "a.mp4"), ["--video a.mp4", LEFT_OUT]),
+        ((*SMOKE, "--at-trial", "2"), ["--at-trial 2", LEFT_OUT]),
+        ((*SMOKE, "--tag", "x"), ["--tag x", LEFT_OUT]),
+        ((*SMOKE, "--task", "forward"), ["--task forward", LEFT_OUT]),
+        ((*SMOKE, "--from", "there"), ["--from there", LEFT_OUT]),
         (
             ("--phase", "explore", "--preset", "paper"),
             ["--preset paper", "hours", "--allow-cpu"],
@@ -123,19 +119,16 @@ RATE = ["--training.learning-rate", "1e-09 to 1.0"]
         ((*SMOKE, "--num-processes", "2"), ["--num-processes 2", "left out, unless"]),
         ((*SMOKE, "--process-id", "0"), ["--process-id 0", "left out, unless"]),
         ((*SMOKE, *AUTO, "--num-processes", "2"), ["--num-processes 2", "left out"]),
-        ((*SMOKE, *AT[:1], "host"), [AT[0], "host is not", "HOST:PORT or auto"]),
-        ((*SMOKE, *AT[:1], ":1"), [AT[0], "HOST:PORT or auto"]),
-        ((*SMOKE, *AT[:1], "h:123456"), [AT[0], "HOST:PORT or auto"]),
-        ((*SMOKE, *AT), ["--num-processes None", "1 or more", AT[0]]),
-        ((*SMOKE, *AT, "--num-processes", "x"), ["--num-processes", "1 to 100,000"]),
         *[
-            (
-                (*SMOKE, *AT, "--num-processes", "2", *own),
-                [" ".join(own), "0 to", "(2)"],
-            )
+            ((*SMOKE, AT[0], address), [f"{AT[0]} {address} is", "HOST:PORT or auto"])
+            for address in ("host", ":1", "h:123456")
+        ],
+        ((*SMOKE, *AT), ["--num-processes None", "1 or more", AT[0]]),
+        ((*SMOKE, *AT, "--num-processes", "0"), ["--num-processes 0", "1 to 100,000"]),
+        *[
+            ((*SMOKE, *AT, "--num-processes", "2", *own), [" ".join(own), "0 to"])
             for own in ((), ("--process-id", "2"), ("--process-id", "-1"))
         ],
-        ((*SMOKE, *AT, "--num-processes", "0"), ["--num-processes 0", "1 or more"]),
         (("--phase", "report", *AUTO), ["--coordinator-address auto", "in report"]),
     ],
     ids=str,
@@ -175,6 +168,22 @@ def test_later_phases_take_the_numbers_of_the_run(out):
     assert cli.explored_run(config) == path.parent
 
 
+def test_a_run_gives_its_numbers_and_nothing_else(out, tmp_path):
+    """What a folder that others wrote to may not decide: names, places, a process."""
+    elsewhere = tmp_path / "elsewhere"
+    path = explored(
+        out, chunk_length=5, task="forward", tag="x/../../y", source=elsewhere,
+        at_trial=7, video=elsewhere / "a.mp4", debug=True, coordinator_address="h:1",
+    )  # fmt: skip
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "out": str(elsewhere), "name": "../x"}))
+    config = cli.parse([*LATER, "--out", str(out)])
+    smoke = PRESETS["smoke"]
+    assert config == dataclasses.replace(
+        smoke, phase="zero-shot", out=out, chunk_length=5
+    )
+
+
 def test_from_names_a_run_anywhere(out):
     path = explored(out, name="mine", arm="count", num_bits=16)
     config = cli.parse(["--phase", "finetune", "--from", str(path.parent)])
@@ -199,7 +208,7 @@ def test_a_run_keeps_its_labels(fail, out):
         (("--num-bits", "16"), "--num-bits 16 is not valid; it must be 32"),
         (("--num-trials", "4"), "--num-trials 4 is not valid; it must be 3"),
         (("--model.hidden-size", "8"), "--model.hidden-size 8 is not valid"),
-        (("--tag", "forward"), "--tag forward is not valid; it must not be a task"),
+        (("--tag", "forward"), "--tag forward is not valid; it must be something else"),
         (("--tag", "../x"), "--tag: run '../x' is not a valid name"),
     ],
 )
@@ -213,7 +222,9 @@ def test_a_model_is_called_what_it_is(fail, out, flags, words):
     ("text", "words"),
     [
         ('{"num_trails": 3}', "unknown entry 'num_trails'"),
-        ('{"planner": {"elites": 3}}', "unknown entry 'elites'"),
+        ('{"planner": {"elites": 3}}', "unknown entry 'planner.elites'"),
+        ("[]", "config.json: it is [], not an object"),
+        ('{"model": null}', "config.json: model is None, not an object"),
         ('{"num_trials": NaN}', "NaN"),
         ("{", "line 1, column 2"),
         ("", "cannot be read"),
@@ -223,33 +234,6 @@ def test_a_damaged_config_is_one_line(fail, out, text, words):
     explored(out).write_text(text)
     code, line = fail(*LATER)
     assert code == 3 and words in line
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_configs_survive_json(preset, tmp_path):
-    config = dataclasses.replace(
-        PRESETS[preset], phase="finetune", seeds=(1, 2**32 - 1), video=tmp_path / "a"
-    )
-    data = json.loads(json.dumps(cli.to_json(config)))
-    default = dataclasses.replace(PRESETS["paper"], phase="explore", num_trials=7)
-    assert cli.from_json(data, default) == config
-    del data["num_trials"], data["planner"]["horizon"]
-    older = cli.from_json(data, default)
-    assert older.num_trials == 7 and older.planner.horizon == default.planner.horizon
-    with pytest.raises(CheckpointError, match="unknown entry 'colour'"):
-        cli.from_json({**data, "colour": 1}, default)
-
-
-def test_differences_name_the_field():
-    old = cli.to_json(dataclasses.replace(PRESETS["smoke"], phase="explore"))
-    new = json.loads(json.dumps(old))
-    default = cli.to_json(PRESETS["paper"])
-    assert cli.differences(old, new, (), default) == []
-    new["planner"]["horizon"], new["seeds"], new["debug"] = 5, [1], True
-    assert cli.differences(old, new, ("debug",), default) == [
-        "planner.horizon: 3 (there) vs 5 (now)",
-        "seeds: [0] (there) vs [1] (now)",
-    ]
 
 
 def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
@@ -293,40 +277,48 @@ def test_what_an_older_run_lacks_is_that_of_its_preset_and_arm(out, said):
     assert config.tuning == PRESETS["paper"].tuning
 
 
-def test_what_an_older_version_did_not_write_was_the_default():
-    default = cli.to_json(dataclasses.replace(PRESETS["paper"], phase="explore"))
-    old = json.loads(json.dumps(default))
-    del old["refit"]["bootstrap"], old["pessimism"], old["tuning"]
-    assert cli.differences(old, default, (), default) == []
-    new = {**default, "pessimism": 3.0}
-    new["refit"] = {**default["refit"], "bootstrap": False}
-    assert cli.differences(old, new, (), default) == [
-        "pessimism: 0.0 (there) vs 3.0 (now)",
-        "refit.bootstrap: True (there) vs False (now)",
-    ]
-    # What only the older one has is nothing this version could do differently.
-    assert cli.differences({**old, "colour": 1}, default, (), default) == []
-
-
-@pytest.mark.parametrize("flags", [(), SMOKE, LATER])
-def test_help_explains_every_flag(flags, out, capsys):
+def help_of(capsys, *flags):
     with pytest.raises(SystemExit) as stop:
-        main([*flags, "--out", str(out), "--help"])
+        main([*flags, "--help"])
     assert stop.value.code == 0
-    text = capsys.readouterr().out
+    return capsys.readouterr().out
 
-    def check(config, prefix):
-        for field in dataclasses.fields(config):
-            value = getattr(config, field.name)
-            name = {"source": "from"}.get(field.name, field.name)
-            flag = prefix + name.replace("_", "-")
-            if dataclasses.is_dataclass(value):
-                check(value, f"{flag}.")
-            else:
-                assert flag in text
 
-    check(PRESETS["smoke"], "--")
-    assert "experiments.run" in text
+@pytest.mark.parametrize("said", [("{}",), ("--phase", "{}", "--preset", "smoke")])
+@pytest.mark.parametrize("phase", COMMANDS)
+def test_the_help_of_a_phase_explains_all_its_flags(phase, said, capsys):
+    text = help_of(capsys, *(word.format(phase) for word in said))
+    assert f"experiments.run {phase}" in text
+    assert all(flag(entry.name) in text for entry in entries(COMMANDS[phase]))
+
+
+def test_the_first_help_fits_two_screens(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = help_of(capsys).splitlines()
+    assert len(lines) <= 90 and max(map(len, lines)) <= 80
+    text = "\n".join(lines)
+    assert all(phase in text for phase in COMMANDS)
+    assert "--preset" in text and "--planner.horizon" not in text
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("explore", "--preset", "smoke", "--seeds", "1", "2"),
+        ("--phase", "explore", "--preset", "smoke", "--seeds", "1", "2"),
+        ("--preset", "smoke", "--seeds", "1", "2", "--phase", "explore"),
+        ("--seeds", "1", "2", "--phase=explore", "--preset=smoke"),
+    ],
+)
+def test_a_phase_is_the_first_word_or_a_flag_anywhere(flags):
+    want = dataclasses.replace(PRESETS["smoke"], seeds=(1, 2))
+    assert cli.parse(flags) == want
+
+
+def test_a_report_may_stand_behind_the_flags_of_other_phases(out):
+    flags = ("--preset", "paper", "--engine", "mujoco", "--out", str(out))
+    config = cli.parse([*flags, "--phase", "report"])
+    assert (config.phase, config.out) == ("report", out)
 
 
 def test_laptop_is_the_default():

@@ -1,0 +1,231 @@
+"""The command line as tyro reads it: which flags a phase has, and what was given."""
+
+import contextlib
+import dataclasses
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
+
+from experiments.config import (
+    Attempt,
+    Basics,
+    Compute,
+    Config,
+    Origin,
+    Output,
+    Process,
+    Science,
+    part,
+)
+from experiments.entries import entries, flag, hints, read
+from experiments.errors import UsageError
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Explore(Process, Compute, Science, Output, Basics):
+    """Phase 1: learns a model, without a reward.
+
+    The numbers of phase 2 are kept for the commands that start from this run.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class ZeroShot(Process, Compute, Science, Origin, Attempt, Output, Basics):
+    """Phase 2: performs tasks with an explored model and learns nothing.
+
+    The numbers are those of the exploration run unless a flag says otherwise.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class Finetune(ZeroShot):
+    """Phase 2 goes on: learns from the trials of a task, too.
+
+    The numbers are those of the exploration run unless a flag says otherwise.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Makes tables and figures of all logs in a folder."""
+
+    out: Path = Path("runs")
+    """Folder of all runs; the report is in OUT/report."""
+    debug: bool = False
+    """Show tracebacks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Overview(Origin, Attempt, Output, Basics):
+    """The flags that are used most."""
+
+
+COMMANDS = {
+    "explore": Explore,
+    "zero-shot": ZeroShot,
+    "finetune": Finetune,
+    "report": Report,
+}
+_PROG = "experiments.run"
+_ABOUT = """Unsupervised exploration with deep model-based RL on HalfCheetah.
+
+- explore: learns a model without a reward
+- zero-shot: performs four tasks with it, and learns nothing
+- finetune: goes on learning, with the rewards of the tasks
+- report: makes tables and figures of all runs
+
+The same command continues a run that was stopped.
+
+`explore` may be said as `--phase explore`, anywhere among the flags.
+
+These are the flags used most; `explore --help` has all numbers of a phase."""
+
+
+def of(
+    role: type[T], argv: Sequence[str], default: T, command: str | None = None
+) -> tuple[T, list[str]]:
+    """Returns the flags of a dataclass and what is left of a command line.
+
+    Args:
+      role: its entries are the flags.
+      argv: the command line.
+      default: what flags that are not given are.
+      command: the phase that `--help` explains; None to leave that to others.
+
+    Raises:
+      UsageError: if the value of a flag is not valid.
+      SystemExit: after `--help`.
+    """
+    found, rest = tyro.cli(
+        role,
+        args=list(argv),
+        default=default,
+        return_unknown_args=True,
+        add_help=command is not None,
+        registry=_AS_WRITTEN,
+        prog=f"{_PROG} {command}",
+    )
+    return read(role, _given(found), default, _refuse), rest
+
+
+def explain(default: Config) -> None:
+    """Prints what there is to do and the flags that are used most.
+
+    Raises:
+      SystemExit: when that is done.
+    """
+    tyro.cli(
+        Overview,
+        args=["--help"],
+        default=part(default, Overview),
+        description=_ABOUT,
+        registry=_AS_WRITTEN,
+        prog=f"{_PROG} {{{','.join(COMMANDS)}}}",
+    )
+
+
+def refuse_rest(rest: Sequence[str], command: str) -> None:
+    """Raises UsageError for what no flag of a phase took."""
+    if not rest:
+        return
+    said = rest[0].partition("=")[0]
+    name = said.replace("_", "-")
+    others = [phase for phase, role in COMMANDS.items() if name in _flags(role)]
+    if others:
+        why = f"left out in {command}; it is for {' and '.join(others)}"
+        raise UsageError(f"{' '.join(rest[:2])} is not valid; it must be {why}.")
+    near = difflib.get_close_matches(name, _flags(COMMANDS[command]), 1)
+    hint = f"Perhaps {near[0]}?" if near else "See --help."
+    raise UsageError(f"{said} is not a flag of {command}. {hint}")
+
+
+def _flags(role: type) -> list[str]:
+    return [flag(entry.name) for entry in entries(role)]
+
+
+_AS_WRITTEN = ConstructorRegistry()
+
+
+@_AS_WRITTEN.primitive_rule
+def _words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Leaves the words behind a flag to `read`, whose errors say what is valid."""
+    if info.type is bool or dataclasses.is_dataclass(info.type):
+        return None
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=_metavar(info.type),
+        instance_from_str=list,
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: (
+            list(map(str, value)) if isinstance(value, tuple) else [str(value)]
+        ),
+    )
+
+
+def _metavar(hint: Any) -> str:
+    """Returns what a help calls a value."""
+    if get_origin(hint) is Literal:
+        return "{" + ",".join(get_args(hint)) + "}"
+    if get_origin(hint) is tuple:
+        return f"[{_metavar(get_args(hint)[0])} ...]"
+    kind = _kinds(hint)[0]
+    return {int: "INT", float: "FLOAT", Path: "PATH"}.get(kind, "TEXT")
+
+
+def _kinds(hint: Any) -> list[Any]:
+    """Returns the types that an annotation leaves open."""
+    if get_origin(hint) is Annotated:
+        return _kinds(hint.__origin__)
+    if get_origin(hint) in (Union, UnionType):
+        return [kind for one in get_args(hint) for kind in _kinds(one)]
+    return [hint]
+
+
+def _given(found: Any) -> dict[str, Any]:
+    """Returns the values of the flags that were given, by the names of fields."""
+    given: dict[str, Any] = {}
+    for name, hint in hints(type(found)).items():
+        value = getattr(found, name)
+        if dataclasses.is_dataclass(value):
+            given[name] = _given(value)
+        elif isinstance(value, list):
+            given[name] = _values(hint, value)
+        elif isinstance(value, bool):
+            given[name] = value
+    return given
+
+
+def _values(hint: Any, words: list[str]) -> Any:
+    """Makes numbers of the words behind a flag, as far as they are some."""
+    hint = hint.__origin__ if get_origin(hint) is Annotated else hint
+    if get_origin(hint) is tuple:
+        return [_value(get_args(hint)[0], word) for word in words]
+    return _value(hint, words[0]) if len(words) == 1 else words
+
+
+def _value(hint: Any, word: str) -> Any:
+    for kind in _kinds(hint):
+        if kind is NoneType and word == "None":
+            return None
+        if kind in (int, float):
+            with contextlib.suppress(ValueError):
+                return kind(word)
+    return word
+
+
+def _refuse(name: str, value: Any, wanted: str | None) -> UsageError:
+    shown = value
+    if isinstance(value, list):
+        shown = " ".join(map(str, value)) or "with no value"
+    return UsageError(f"{flag(name)} {shown} is not valid; it must be {wanted}.")
