@@ -16,7 +16,7 @@ from experiments.config import (
     Science,
     part,
 )
-from experiments.entries import differences, from_json, to_json
+from experiments.entries import from_json
 from experiments.errors import CheckpointError, UsageError
 from experiments.parallel.distributed import ProcessSpec
 from experiments.presets import preset_config
@@ -28,17 +28,6 @@ from experiments.validate import (
     require,
     validate,
 )
-
-__all__ = [
-    "PRETRAINED",
-    "differences",
-    "explored_run",
-    "from_json",
-    "parse",
-    "process_spec",
-    "results_folder",
-    "to_json",
-]
 
 # Explored models that come with the code; see `experiments.tools.pretrained`.
 PRETRAINED = Path(__file__).parents[1] / "results" / "pretrained"

@@ -5,9 +5,9 @@ import dataclasses
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
+import msgspec
 import tyro
 from tyro.constructors import (
     ConstructorRegistry,
@@ -80,10 +80,7 @@ COMMANDS = {
 _PROG = "experiments.run"
 _ABOUT = """Unsupervised exploration with deep model-based RL on HalfCheetah.
 
-- explore: learns a model without a reward
-- zero-shot: performs four tasks with it, and learns nothing
-- finetune: goes on learning, with the rewards of the tasks
-- report: makes tables and figures of all runs
+{}
 
 The same command continues a run that was stopped.
 
@@ -125,11 +122,13 @@ def explain(default: Config) -> None:
     Raises:
       SystemExit: when that is done.
     """
+    docs = {name: str(role.__doc__) for name, role in COMMANDS.items()}
+    phases = [f"- {name}: {doc.splitlines()[0]}" for name, doc in docs.items()]
     tyro.cli(
         Overview,
         args=["--help"],
         default=part(default, Overview),
-        description=_ABOUT,
+        description=_ABOUT.format("\n".join(phases)),
         registry=_AS_WRITTEN,
         prog=f"{_PROG} {{{','.join(COMMANDS)}}}",
     )
@@ -175,21 +174,14 @@ def _words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
 def _metavar(hint: Any) -> str:
     """Returns what a help calls a value."""
+    first, *_ = *get_args(hint), None
     if get_origin(hint) is Literal:
         return "{" + ",".join(get_args(hint)) + "}"
     if get_origin(hint) is tuple:
-        return f"[{_metavar(get_args(hint)[0])} ...]"
-    kind = _kinds(hint)[0]
-    return {int: "INT", float: "FLOAT", Path: "PATH"}.get(kind, "TEXT")
-
-
-def _kinds(hint: Any) -> list[Any]:
-    """Returns the types that an annotation leaves open."""
-    if get_origin(hint) is Annotated:
-        return _kinds(hint.__origin__)
-    if get_origin(hint) in (Union, UnionType):
-        return [kind for one in get_args(hint) for kind in _kinds(one)]
-    return [hint]
+        return f"[{_metavar(first)} ...]"
+    if first is not None:
+        return _metavar(first)
+    return {int: "INT", float: "FLOAT", Path: "PATH"}.get(hint, "TEXT")
 
 
 def _given(found: Any) -> dict[str, Any]:
@@ -207,7 +199,7 @@ def _given(found: Any) -> dict[str, Any]:
 
 
 def _values(hint: Any, words: list[str]) -> Any:
-    """Makes numbers of the words behind a flag, as far as they are some."""
+    """Returns what is meant by the words behind a flag; a single one is no list."""
     hint = hint.__origin__ if get_origin(hint) is Annotated else hint
     if get_origin(hint) is tuple:
         return [_value(get_args(hint)[0], word) for word in words]
@@ -215,12 +207,10 @@ def _values(hint: Any, words: list[str]) -> Any:
 
 
 def _value(hint: Any, word: str) -> Any:
-    for kind in _kinds(hint):
-        if kind is NoneType and word == "None":
-            return None
-        if kind in (int, float):
-            with contextlib.suppress(ValueError):
-                return kind(word)
+    """Returns a word, or the number or None that it stands for where that is valid."""
+    for meant in (int, float, {"None": None}.__getitem__):
+        with contextlib.suppress(ValueError, KeyError, msgspec.ValidationError):
+            return msgspec.convert(meant(word), hint)
     return word
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from experiments import cli, session
 from experiments.config import Config
 from experiments.cost import check_cpu, memory_advice
+from experiments.entries import from_json, to_json
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -33,8 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
         with distributed.joined(cli.process_spec(arguments), _say):
-            plain = distributed.on_first(lambda: cli.to_json(cli.parse(arguments)))
-            config = cli.from_json(plain, Config())
+            plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
+            config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config)
     except RunError as error:
@@ -86,7 +87,7 @@ def _explore(config: Config, folder: Path) -> None:
 
 def _opened(config: Config, folder: Path) -> AbstractContextManager[None]:
     """Returns what holds a run's folder, on the process that has one."""
-    run = session.open_run(folder, cli.to_json(config), say=_say)
+    run = session.open_run(folder, to_json(config), say=_say)
     return distributed.held_by_first(run)
 
 

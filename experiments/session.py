@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from experiments import cli
 from experiments.config import NUM_TASKS
+from experiments.entries import differences
 from experiments.errors import CheckpointError, InterruptedRun, RunError
 from experiments.storage import rundir
 
@@ -62,7 +62,7 @@ def open_run(
 
 def _compare(path: Path, config: dict[str, Any]) -> None:
     if path.exists():
-        lines = cli.differences(rundir.read_json(path), config)
+        lines = differences(rundir.read_json(path), config)
         if lines:
             another = "--name" if config["phase"] == "explore" else "--tag"
             raise CheckpointError(

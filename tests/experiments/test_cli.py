@@ -7,9 +7,8 @@ import pytest
 
 from experiments import cli
 from experiments.config import Config
-from experiments.entries import entries, flag
+from experiments.entries import to_json
 from experiments.errors import OutOfMemoryError
-from experiments.flags import COMMANDS
 from experiments.presets import PRESETS
 from experiments.run import _plain_errors, main
 
@@ -43,101 +42,86 @@ def explored(out, name="smoke-epistemic", **changes):
     config = dataclasses.replace(PRESETS["smoke"], phase="explore", **changes)
     (out / name).mkdir(parents=True)
     path = out / name / "config.json"
-    path.write_text(json.dumps(cli.to_json(config)))
+    path.write_text(json.dumps(to_json(config)))
     return path
 
 
-AT = ("--coordinator-address", "host:1")
-AUTO = (AT[0], "auto")
-LEFT_OUT = "left out in explore; it is for zero-shot and finetune"
+# Command lines, after those of SMOKE where they begin with a flag, and what is said.
+WRONG = """
+fly --preset smoke                      | --phase fly; finetune
+report --num-trails 3                   | --num-trails is not a flag
+report                                  | metrics.jsonl
+report --coordinator-address auto       | --coordinator-address auto; in report
+explore --preset paper                  | --preset paper; hours; --allow-cpu
+--phase                                 | --phase with no value; explore, zero-shot
+--phase fly                             | --phase fly; finetune
+--preset huge                           | --preset huge; laptop, paper, smoke
+--arm x                                 | --arm x; one-step
+--num-trails 3                          | --num-trails is not a; Perhaps --num-trials?
+--num_trails=3                          | --num_trails is not a; Perhaps --num-trials?
+--allow-cpu=true                        | true is not a flag
+--allow-cpu extra                       | extra is not a flag
+--num-trials                            | --num-trials with no value; 1 to 100,000
+--num_trials=0                          | --num-trials 0; 1 to 100,000
+--num-trials -1                         | --num-trials -1; 1 to 100,000
+--num-trials 1e9                        | --num-trials 1e9; 1 to 100,000
+--num-trials 2.5                        | --num-trials 2.5; 1 to 100,000
+--num-trials nan                        | --num-trials nan; 1 to 100,000
+--training.learning-rate nan            | learning-rate nan; 1e-09 to 1.0
+--model.state-margin inf                | state-margin inf; 0.0 to 1,000,000.0 or None
+--tuning.num-epochs 0                   | --tuning.num-epochs 0; 1 to 10,000
+--seeds                                 | --seeds (); one or more different
+--seeds 0 -1                            | --seeds 0 -1; 0 to 4,294,967,295
+--seeds 0 0                             | --seeds (0, 0); different
+--planner.num-elites 9                  | --planner.num-elites 9; num-samples (8)
+--task-planner.num-particles 4          | --task-planner.num-particles 4; multiple; (3)
+--model.num-members 1                   | members 1; 2 or more for --arm epistemic
+--arm random --model.num-members 1 --pessimism 1 | --pessimism 1.0; 0 with one member
+--random-trials 4                       | --random-trials 4; --num-trials (3)
+--chunk-length 7                        | --chunk-length 7; divisor; (20)
+--task forward                          | --task forward; left out in explore
+--tag x                                 | --tag x; it is for zero-shot and finetune
+--from there                            | --from there; left out in explore
+--at-trial 2                            | --at-trial 2; left out in explore
+--video a.mp4                           | --video a.mp4; left out in explore
+--phase zero-shot --arm x               | --arm x; one-step
+--phase zero-shot --task swim           | --task swim; back-flip
+--phase zero-shot --name ../x           | --name; '../x'; at most 64
+--num-processes 2                       | --num-processes 2; left out, unless
+--process-id 0                          | --process-id 0; left out, unless
+--coordinator-address auto --process-id 0 | --process-id 0; left out, unless
+--coordinator-address host              | address host is; HOST:PORT or auto
+--coordinator-address :1                | address :1 is; HOST:PORT or auto
+--coordinator-address h:123456          | address h:123456 is; HOST:PORT or auto
+--coordinator-address h:1               | --num-processes None; 1 or more
+--coordinator-address h:1 --num-processes 0 | --num-processes 0; 1 to 100,000
+--coordinator-address h:1 --num-processes 2 | --process-id None; 0 to; (2)
+--coordinator-address h:1 --num-processes 2 --process-id 2 | --process-id 2; 0 to; (2)
+"""
+
+
+@pytest.mark.parametrize("case", WRONG.strip().splitlines(), ids=lambda case: case)
+def test_bad_usage_is_one_line_before_anything_is_created(fail, out, case):
+    flags, _, words = case.partition("|")
+    code, line = fail(*(SMOKE if flags.startswith("-") else ()), *flags.split())
+    assert code == 2
+    assert all(word.strip() in line for word in words.split(";"))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        ((), ["--phase is missing", "explore, zero-shot, finetune, report"]),
-        (("--phase",), ["--phase with no value", "explore, zero-shot"]),
-        (("--phase", "fly"), ["--phase fly", "finetune"]),
-        (("fly", "--preset", "smoke"), ["--phase fly", "finetune"]),
-        ((*SMOKE, "--preset", "huge"), ["--preset huge", "laptop, paper, smoke"]),
-        ((*LATER, "--arm", "x"), ["--arm x", "one-step"]),
-        ((*LATER, "--task", "swim"), ["--task swim", "back-flip"]),
-        ((*SMOKE, "--num-trails", "3"), ["--num-trails", "Perhaps", "--num-trials"]),
-        ((*SMOKE, "--num_trails=3"), ["--num_trails is", "Perhaps", "--num-trials"]),
-        (("--phase", "report", "--num-trails", "3"), ["--num-trails is not a flag"]),
-        ((*SMOKE, "extra"), ["extra"]),
-        ((*SMOKE, "--debug=true"), ["true is not a flag"]),
-        *[
-            ((*SMOKE, "--num-trials", value), [f"--num-trials {value}", "1 to 100,000"])
-            for value in ("0", "-1", "abc", "nan", "inf", "1e9", "2.5")
-        ],
-        ((*SMOKE, "--num-trials"), ["--num-trials with no value", "1 to 100,000"]),
-        ((*SMOKE, "--num_trials=0"), ["--num-trials 0", "1 to 100,000"]),
-        ((*SMOKE, "--training.learning-rate", "nan"), ["nan", "1e-09 to 1.0"]),
-        (
-            (*SMOKE, "--model.state-margin", "inf"),
-            ["inf", "0.0 to 1,000,000"],
-        ),
-        ((*SMOKE, "--tuning.num-epochs", "0"), ["--tuning.num-epochs", "1 to 10,000"]),
-        ((*SMOKE, "--seeds"), ["--seeds", "one or more different"]),
-        ((*SMOKE, "--seeds", "0", "-1"), ["--seeds 0 -1", "0 to 4,294,967,295"]),
-        ((*SMOKE, "--seeds", "0", "0"), ["--seeds", "(0, 0)", "different"]),
-        (
-            (*SMOKE, "--planner.num-elites", "9"),
-            ["--planner.num-elites 9", "2 to --planner.num-samples (8)"],
-        ),
-        (
-            (*SMOKE, "--task-planner.num-particles", "4"),
-            ["--task-planner.num-particles 4", "multiple", "(3)"],
-        ),
-        (
-            (*SMOKE, "--model.num-members", "1"),
-            ["--model.num-members 1", "2 or more for --arm epistemic"],
-        ),
-        (
-            (*SMOKE, "--arm", "random", "--model.num-members", "1", "--pessimism", "1"),
-            ["--pessimism 1.0", "0 with one member"],
-        ),
-        ((*SMOKE, "--random-trials", "4"), ["--random-trials 4", "--num-trials (3)"]),
-        ((*SMOKE, "--chunk-length", "7"), ["--chunk-length 7", "divisor", "(20)"]),
-        *[
-            ((*SMOKE, f"--name={name}"), ["--name", repr(name), "letters, digits"])
-            for name in ("a/b", "..", ".", "", "-x", "/etc/x", "a\0b", "a ", "a\nb")
-        ],
-        ((*SMOKE, "--name", "a" * 300), ["--name", "aaa...", "at most 64"]),
-        ((*LATER, "--name", "../x"), ["--name", "'../x'", "at most 64"]),
-        ((*SMOKE, "--video", "a.mp4"), ["--video a.mp4", LEFT_OUT]),
-        ((*SMOKE, "--at-trial", "2"), ["--at-trial 2", LEFT_OUT]),
-        ((*SMOKE, "--tag", "x"), ["--tag x", LEFT_OUT]),
-        ((*SMOKE, "--task", "forward"), ["--task forward", LEFT_OUT]),
-        ((*SMOKE, "--from", "there"), ["--from there", LEFT_OUT]),
-        (
-            ("--phase", "explore", "--preset", "paper"),
-            ["--preset paper", "hours", "--allow-cpu"],
-        ),
-        (("--phase", "report"), ["metrics.jsonl"]),
-        ((*SMOKE, "--num-processes", "2"), ["--num-processes 2", "left out, unless"]),
-        ((*SMOKE, "--process-id", "0"), ["--process-id 0", "left out, unless"]),
-        ((*SMOKE, *AUTO, "--num-processes", "2"), ["--num-processes 2", "left out"]),
-        *[
-            ((*SMOKE, AT[0], address), [f"{AT[0]} {address} is", "HOST:PORT or auto"])
-            for address in ("host", ":1", "h:123456")
-        ],
-        ((*SMOKE, *AT), ["--num-processes None", "1 or more", AT[0]]),
-        ((*SMOKE, *AT, "--num-processes", "0"), ["--num-processes 0", "1 to 100,000"]),
-        *[
-            ((*SMOKE, *AT, "--num-processes", "2", *own), [" ".join(own), "0 to"])
-            for own in ((), ("--process-id", "2"), ("--process-id", "-1"))
-        ],
-        (("--phase", "report", *AUTO), ["--coordinator-address auto", "in report"]),
-    ],
-    ids=str,
+    "name", ["a/b", "..", ".", "", "-x", "/etc/x", "a\0b", "a ", "a\nb", "a" * 300]
 )
-def test_bad_usage_is_one_line_before_anything_is_created(fail, out, flags, words):
-    code, line = fail(*flags)
-    assert code == 2
-    assert all(word in line for word in words)
+def test_a_name_is_that_of_one_folder(fail, out, name):
+    code, line = fail(*SMOKE, f"--name={name}")
+    assert code == 2 and "--name: run" in line and "at most 64" in line
+    assert (repr(name) if len(name) < 64 else "aaa...'") in line
     assert not out.exists()
+
+
+def test_a_phase_is_needed(fail):
+    code, line = fail("--preset", "smoke")
+    assert code == 2 and "--phase is missing" in line and "explore, zero-shot" in line
 
 
 @pytest.mark.parametrize("phase", ["zero-shot", "finetune"])
@@ -275,50 +259,6 @@ def test_what_an_older_run_lacks_is_that_of_its_preset_and_arm(out, said):
     assert not config.refit.bootstrap
     assert config.refit.num_epochs == PRESETS["smoke"].refit.num_epochs  # as recorded
     assert config.tuning == PRESETS["paper"].tuning
-
-
-def help_of(capsys, *flags):
-    with pytest.raises(SystemExit) as stop:
-        main([*flags, "--help"])
-    assert stop.value.code == 0
-    return capsys.readouterr().out
-
-
-@pytest.mark.parametrize("said", [("{}",), ("--phase", "{}", "--preset", "smoke")])
-@pytest.mark.parametrize("phase", COMMANDS)
-def test_the_help_of_a_phase_explains_all_its_flags(phase, said, capsys):
-    text = help_of(capsys, *(word.format(phase) for word in said))
-    assert f"experiments.run {phase}" in text
-    assert all(flag(entry.name) in text for entry in entries(COMMANDS[phase]))
-
-
-def test_the_first_help_fits_two_screens(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    lines = help_of(capsys).splitlines()
-    assert len(lines) <= 90 and max(map(len, lines)) <= 80
-    text = "\n".join(lines)
-    assert all(phase in text for phase in COMMANDS)
-    assert "--preset" in text and "--planner.horizon" not in text
-
-
-@pytest.mark.parametrize(
-    "flags",
-    [
-        ("explore", "--preset", "smoke", "--seeds", "1", "2"),
-        ("--phase", "explore", "--preset", "smoke", "--seeds", "1", "2"),
-        ("--preset", "smoke", "--seeds", "1", "2", "--phase", "explore"),
-        ("--seeds", "1", "2", "--phase=explore", "--preset=smoke"),
-    ],
-)
-def test_a_phase_is_the_first_word_or_a_flag_anywhere(flags):
-    want = dataclasses.replace(PRESETS["smoke"], seeds=(1, 2))
-    assert cli.parse(flags) == want
-
-
-def test_a_report_may_stand_behind_the_flags_of_other_phases(out):
-    flags = ("--preset", "paper", "--engine", "mujoco", "--out", str(out))
-    config = cli.parse([*flags, "--phase", "report"])
-    assert (config.phase, config.out) == ("report", out)
 
 
 def test_laptop_is_the_default():
