@@ -49,7 +49,7 @@ def test_a_phase_is_the_first_word_or_a_flag_anywhere(flags):
     assert cli.parse(flags) == want
 
 
-def test_a_report_may_stand_behind_the_flags_of_other_phases(out):
-    flags = ("--preset", "paper", "--engine", "mujoco", "--out", str(out))
+def test_a_report_may_stand_behind_the_flags_of_other_phases(tmp_path):
+    flags = ("--preset", "paper", "--engine", "mujoco", "--out", str(tmp_path))
     config = cli.parse([*flags, "--phase", "report"])
-    assert (config.phase, config.out) == ("report", out)
+    assert (config.phase, config.out) == ("report", tmp_path)
