@@ -10,7 +10,7 @@ import optax
 from jax import Array
 
 import jaxpets
-from experiments.arms import NO_DATA, make_arm
+from experiments.arms import make_arm
 from experiments.config import (
     Config,
     ModelConfig,
@@ -86,7 +86,10 @@ def build(config: Config) -> Parts:
         ),
         refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
         finetuner=learner(
-            config.tuning, NO_DATA, config.task_length, explored + finetuned
+            config.tuning,
+            jaxpets.RewardData(),
+            config.task_length,
+            explored + finetuned,
         ),
     )
 

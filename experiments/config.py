@@ -162,7 +162,7 @@ class Evaluation:
     eval_trials: Annotated[TaskTrials, COUNTED] = 5
     """zero-shot: trials per task and seed."""
     pessimism: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
-    """Performing: standard deviations between members taken off a task's reward."""
+    """Standard deviations between members taken off the reward of a task."""
     refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
     task_planner: PlannerConfig = PlannerConfig()
 
@@ -182,18 +182,18 @@ class Science(Tuning, Evaluation, Exploration):
 
 
 @dataclasses.dataclass(frozen=True)
-class Attempt:
-    """Which attempt at phase 2 this is."""
+class Variant:
+    """Which tasks phase 2 is about, and which variant of it this is."""
 
     task: TaskName = "all"
     """The task to perform."""
     tag: str | None = None
-    """Name of another attempt at phase 2, with other numbers: it has a folder of its
-    own in the run, and, if it is a zero-shot, a row of its own in the report."""
+    """Name of a variant of phase 2, with other numbers: it has a folder of its own in
+    the run, and, if it is a zero-shot, a row of its own in the report."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Run(Attempt, Science, Phased):
+class Run(Variant, Science, Phased):
     """What a run is: where these are equal, it is the same one."""
 
 
@@ -209,7 +209,7 @@ class Output:
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """What phase 2 starts from, and its film."""
+    """What phase 2 starts from, and its video."""
 
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """The exploration run to start from; by default OUT/NAME."""

@@ -16,7 +16,6 @@ from tyro.constructors import (
 )
 
 from experiments.config import (
-    Attempt,
     Basics,
     Compute,
     Config,
@@ -24,6 +23,7 @@ from experiments.config import (
     Output,
     Process,
     Science,
+    Variant,
     part,
 )
 from experiments.entries import entries, flag, hints, read
@@ -41,7 +41,7 @@ class Explore(Process, Compute, Science, Output, Basics):
 
 
 @dataclasses.dataclass(frozen=True)
-class ZeroShot(Process, Compute, Science, Origin, Attempt, Output, Basics):
+class ZeroShot(Process, Compute, Science, Origin, Variant, Output, Basics):
     """Phase 2: performs tasks with an explored model and learns nothing.
 
     The numbers are those of the exploration run unless a flag says otherwise.
@@ -67,7 +67,7 @@ class Report:
 
 
 @dataclasses.dataclass(frozen=True)
-class Overview(Origin, Attempt, Output, Basics):
+class Overview(Origin, Variant, Output, Basics):
     """The flags that are used most."""
 
 

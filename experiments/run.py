@@ -60,7 +60,7 @@ def _dispatch(config: Config) -> None:
         _explore(config, source)
         return
     step = distributed.on_first(lambda: _explored_step(config, source))
-    folder = cli.results_folder(config) / _attempt(config, step)
+    folder = cli.results_folder(config) / _variant(config, step)
     with _without_gl(), stoppable(), _opened(config, folder):
         from experiments import phases
 
@@ -70,7 +70,7 @@ def _dispatch(config: Config) -> None:
         _video(config, folder)
 
 
-def _attempt(config: Config, step: int) -> str:
+def _variant(config: Config, step: int) -> str:
     """Returns the name of the folder of a later phase: zero-shot-060-forward-TAG."""
     task = [config.task] if config.task != "all" else []
     tag = [config.tag] if config.tag else []
