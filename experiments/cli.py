@@ -109,9 +109,8 @@ def _config(phase: Phase, argv: Sequence[str], default: Config) -> Config:
     """Returns the config of a command line that has no phase."""
     role: Any = flags.COMMANDS[phase]
     own, rest = flags.of(role, argv, part(default, role), phase)
-    if phase == "report":  # flags that are there for other phases do nothing
-        default, rest = flags.of(Config, rest, default)
-    flags.refuse_rest(rest, phase)
+    if rest:
+        default = flags.beside(rest, default, phase)
     config = dataclasses.replace(default, **vars(own), phase=phase)
     check_names(config)
     check_process(config)

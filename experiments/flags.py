@@ -134,23 +134,28 @@ def explain(default: Config) -> None:
     )
 
 
-def refuse_rest(rest: Sequence[str], command: str) -> None:
-    """Raises UsageError for what no flag of a phase took."""
-    if not rest:
-        return
-    said = rest[0].partition("=")[0]
-    name = said.replace("_", "-")
-    others = [phase for phase, role in COMMANDS.items() if name in _flags(role)]
-    if others:
-        why = f"left out in {command}; it is for {' and '.join(others)}"
-        raise UsageError(f"{' '.join(rest[:2])} is not valid; it must be {why}.")
-    near = difflib.get_close_matches(name, _flags(COMMANDS[command]), 1)
-    hint = f"Perhaps {near[0]}?" if near else "See --help."
-    raise UsageError(f"{said} is not a flag of {command}. {hint}")
+def beside(rest: Sequence[str], default: Config, command: str) -> Config:
+    """Returns what is left of a command line, as flags of other phases.
 
+    In a report they do nothing, so that one command line may serve all phases. Others
+    must say what is so anyway.
 
-def _flags(role: type) -> list[str]:
-    return [flag(entry.name) for entry in entries(role)]
+    Raises:
+      UsageError: for what is no flag, or is not for this phase.
+    """
+    found, rest = of(Config, rest, default)
+    if rest:
+        said = rest[0].partition("=")[0]
+        flags = [flag(entry.name) for entry in entries(COMMANDS[command])]
+        near = difflib.get_close_matches(said.replace("_", "-"), flags, 1)
+        hint = f"Perhaps {near[0]}?" if near else "See --help."
+        raise UsageError(f"{said} is not a flag of {command}. {hint}")
+    for entry in entries(Config):
+        if command != "report" and entry.of(found) != entry.of(default):
+            phases = [name for name, role in COMMANDS.items() if entry in entries(role)]
+            wanted = f"left out in {command}; it is for {' and '.join(phases)}"
+            raise _refuse(entry.name, entry.of(found), wanted)
+    return found
 
 
 _AS_WRITTEN = ConstructorRegistry()

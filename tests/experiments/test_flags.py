@@ -42,6 +42,7 @@ def test_the_first_help_fits_two_screens(capsys, monkeypatch):
         ("--phase", "explore", "--preset", "smoke", "--seeds", "1", "2"),
         ("--preset", "smoke", "--seeds", "1", "2", "--phase", "explore"),
         ("--seeds", "1", "2", "--phase=explore", "--preset=smoke"),
+        ("explore", "--preset", "smoke", "--seeds", "1", "2", "--task", "all"),
     ],
 )
 def test_a_phase_is_the_first_word_or_a_flag_anywhere(flags):
