@@ -25,8 +25,9 @@ from jax import Array
 
 import jaxpets
 from benchmarks import rows, workloads
-from experiments import cli, phases
+from experiments import phases
 from experiments.build import build
+from experiments.entries import from_json
 from experiments.errors import RunError
 from experiments.presets import PRESETS
 from experiments.storage import checkpoint, rundir
@@ -109,7 +110,7 @@ def explored(
 def _explored(
     folder: Path, search: workloads.Size
 ) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
-    config = cli.from_json(rundir.read_json(folder / "config.json"), PRESETS["smoke"])
+    config = from_json(rundir.read_json(folder / "config.json"), PRESETS["smoke"])
     num_members = config.model.num_members
     if num_members < 2 or search.num_particles % num_members:
         raise SystemExit(

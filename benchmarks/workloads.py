@@ -7,7 +7,6 @@ longer or shorter for other values.
 import argparse
 import dataclasses
 import functools
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +16,7 @@ import optax
 from jax import Array
 
 import jaxpets
+from experiments.cost import model_flops
 from jaxpets.envs import half_cheetah
 
 
@@ -60,7 +60,7 @@ def named_size(name: str) -> Size:
 
 
 def with_network(size: Size, network: Any) -> Size:
-    """Returns the size with the network of an experiment, its `ModelNumbers`."""
+    """Returns the size with the network of an experiment, its `ModelConfig`."""
     return dataclasses.replace(
         size,
         num_members=network.num_members,
@@ -281,10 +281,5 @@ def candidates_per_action(size: Size, search: str) -> int:
 
 def rollout_flops(size: Size, num_candidates: int) -> float:
     """Returns the operations in the network's matrix products, two per multiply-add."""
-    widths = (
-        half_cheetah.OBS_SIZE + half_cheetah.ACTION_SIZE,  # pitch as sine and cosine,
-        *size.hidden_sizes,  # but no finite-difference velocity
-        2 * half_cheetah.OBS_SIZE,
-    )
-    per_row = sum(a * b for a, b in itertools.pairwise(widths))
-    return 2.0 * per_row * num_candidates * size.num_particles * size.horizon
+    steps = num_candidates * size.num_particles * size.horizon
+    return model_flops(size.hidden_sizes) * steps

@@ -17,10 +17,6 @@ class Arm(NamedTuple):
     reward_data: jaxpets.RewardData
 
 
-# A reward without data of its own.
-NO_DATA = jaxpets.RewardData(lambda key: (), lambda data, params, dataset: data)
-
-
 def make_arm(config: Config, model: jaxpets.Ensemble) -> Arm:
     """Returns the arm that a config names.
 
@@ -31,7 +27,7 @@ def make_arm(config: Config, model: jaxpets.Ensemble) -> Arm:
     return {
         "epistemic": _epistemic,
         "count": _count,
-        "random": lambda config, model: Arm(None, NO_DATA),
+        "random": lambda config, model: Arm(None, jaxpets.RewardData()),
         "oracle": _oracle,
         "one-step": _one_step,
         "info-gain": _info_gain,

@@ -10,8 +10,14 @@ import optax
 from jax import Array
 
 import jaxpets
-from experiments.arms import NO_DATA, make_arm
-from experiments.config import Config, PlannerNumbers, TrainingNumbers
+from experiments.arms import make_arm
+from experiments.config import (
+    Config,
+    ModelConfig,
+    PlannerConfig,
+    TrainingConfig,
+    part,
+)
 from jaxpets.envs import half_cheetah
 
 State = jaxpets.LearnerState
@@ -42,12 +48,7 @@ class Parts(NamedTuple):
 def build(config: Config) -> Parts:
     """Returns the parts for a validated config."""
     env = ENGINES[config.engine]()
-    numbers = config.model
-    size = jaxpets.EnsembleConfig(
-        num_members=numbers.num_members,
-        hidden_sizes=(numbers.hidden_size,) * numbers.num_layers,
-        state_margin=numbers.state_margin,
-    )
+    size = ensemble_config(config.model)
     trained = _ensemble(size, jaxpets.Precision.TF32)
     planned = _ensemble(size, jaxpets.Precision(config.planner.precision))
     arm = make_arm(config, planned)
@@ -55,7 +56,7 @@ def build(config: Config) -> Parts:
     finetuned = config.finetune_trials * config.task_length
 
     def planner(
-        reward_fn: jaxpets.typing.RewardFn, search: PlannerNumbers
+        reward_fn: jaxpets.typing.RewardFn, search: PlannerConfig
     ) -> jaxpets.Planner:
         rollout, is_kernel = _rollout(size, search)
         unroll = is_kernel and jax.default_backend() == "gpu"
@@ -67,9 +68,9 @@ def build(config: Config) -> Parts:
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
     def learner(
-        numbers: TrainingNumbers, data: jaxpets.RewardData, length: int, capacity: int
+        fit: TrainingConfig, data: jaxpets.RewardData, length: int, capacity: int
     ) -> jaxpets.Learner:
-        fitter = _fitter(trained, numbers)
+        fitter = _fitter(trained, fit)
         return jaxpets.learner(
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
@@ -85,7 +86,10 @@ def build(config: Config) -> Parts:
         ),
         refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
         finetuner=learner(
-            config.tuning, NO_DATA, config.task_length, explored + finetuned
+            config.tuning,
+            jaxpets.RewardData(),
+            config.task_length,
+            explored + finetuned,
         ),
     )
 
@@ -99,11 +103,18 @@ def trial_keys(config: Config, phase: int, trial: int) -> Array:
     return jax.vmap(one)(jnp.stack([jax.random.key(s) for s in config.seeds]))
 
 
-def _fitter(ensemble: jaxpets.Ensemble, numbers: TrainingNumbers) -> jaxpets.Fitter:
-    size = jaxpets.FitConfig(
-        numbers.num_epochs, numbers.batch_size, numbers.final_rate, numbers.bootstrap
+def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
+    """Returns the library's config of an ensemble whose hidden layers are equal."""
+    return jaxpets.EnsembleConfig(
+        num_members=model.num_members,
+        hidden_sizes=(model.hidden_size,) * model.num_layers,
+        state_margin=model.state_margin,
     )
-    return jaxpets.fitter(ensemble, optax.adam(numbers.learning_rate), size)
+
+
+def _fitter(ensemble: jaxpets.Ensemble, training: TrainingConfig) -> jaxpets.Fitter:
+    adam = optax.adam(training.learning_rate)
+    return jaxpets.fitter(ensemble, adam, part(training, jaxpets.FitConfig))
 
 
 def _ensemble(
@@ -118,7 +129,7 @@ def _ensemble(
 
 
 def _rollout(
-    size: jaxpets.EnsembleConfig, search: PlannerNumbers
+    size: jaxpets.EnsembleConfig, search: PlannerConfig
 ) -> tuple[jaxpets.typing.RolloutFn, bool]:
     """Returns the rollout of a search, and whether it is a kernel."""
     precision = jaxpets.Precision(search.precision)
@@ -134,21 +145,21 @@ def _rollout(
 
 
 def optimizer(
-    numbers: PlannerNumbers, env: jaxpets.Env, unroll: bool = False
+    search: PlannerConfig, env: jaxpets.Env, unroll: bool = False
 ) -> jaxpets.optimizers.TrajectoryOptimizer:
-    """Returns the search that the numbers describe; unroll is that of `cem`."""
+    """Returns the search that a config describes; unroll is that of `cem`."""
     size = {
-        "horizon": numbers.horizon,
+        "horizon": search.horizon,
         "action_low": env.action_low,
         "action_high": env.action_high,
-        "num_samples": numbers.num_samples,
-        "num_iterations": numbers.num_iterations,
+        "num_samples": search.num_samples,
+        "num_iterations": search.num_iterations,
     }
-    if numbers.optimizer == "mppi":
-        return jaxpets.optimizers.mppi(**size, temperature=numbers.temperature)
-    size |= {"num_elites": numbers.num_elites, "momentum": numbers.momentum}
-    if numbers.optimizer == "icem":
-        return jaxpets.optimizers.icem(**size, noise_beta=numbers.noise_beta)
+    if search.optimizer == "mppi":
+        return jaxpets.optimizers.mppi(**size, temperature=search.temperature)
+    size |= {"num_elites": search.num_elites, "momentum": search.momentum}
+    if search.optimizer == "icem":
+        return jaxpets.optimizers.icem(**size, noise_beta=search.noise_beta)
     return jaxpets.optimizers.cem(
-        **size, legacy_variance=numbers.legacy_variance, unroll=unroll
+        **size, legacy_variance=search.legacy_variance, unroll=unroll
     )

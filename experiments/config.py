@@ -1,12 +1,19 @@
-"""Every number of the experiments: the flags, their ranges and the presets."""
+"""Every number of the experiments: the flags, their ranges and what each is for.
+
+The fields of a Config are declared by what they do. What decides about the numbers of a
+run is `Science`; what says where files are, how fast it goes or which process this is
+stands apart, so that two runs are the same where their `Run` parts are equal.
+"""
 
 import dataclasses
+import enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
+from msgspec import Meta
 
-from experiments.errors import UsageError
+from jaxpets import EnsembleConfig, FitConfig
 
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
@@ -18,64 +25,81 @@ TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
 NUM_TASKS = len(get_args(TaskName)) - 1  # of "all"
 
 
-def number(default: Any, low: float, high: float) -> Any:
-    """Returns a dataclass field with a default and the range of valid values."""
-    return dataclasses.field(default=default, metadata={"range": (low, high)})
+class Mark(enum.Enum):
+    """What else there is to know about a field."""
+
+    EXPLORED = "part of an explored model, so that phase 2 cannot change it"
+    COUNTED = "which runs and how many; the report says so beside its tables"
+
+
+EXPLORED, COUNTED = Mark
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+Trials = Annotated[int, Meta(ge=1, le=100_000)]
+TaskTrials = Annotated[int, Meta(ge=1, le=10_000)]
+Steps = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
 @dataclasses.dataclass(frozen=True)
-class ModelNumbers:
+class ModelConfig:
     """The ensemble."""
 
-    num_members: int = number(5, 1, 100)
+    num_members: Annotated[int, Meta(ge=1, le=100), EXPLORED] = (
+        EnsembleConfig.num_members
+    )
     """Networks in the ensemble."""
-    hidden_size: int = number(200, 1, 8192)
+    hidden_size: Annotated[int, Meta(ge=1, le=8192), EXPLORED] = (
+        EnsembleConfig.hidden_sizes[0]
+    )
     """Width of every hidden layer."""
-    num_layers: int = number(4, 1, 16)
+    num_layers: Annotated[int, Meta(ge=1, le=16), EXPLORED] = len(
+        EnsembleConfig.hidden_sizes
+    )
     """Hidden layers."""
-    state_margin: float | None = number(0.5, 0.0, 1e6)
+    state_margin: Annotated[float, Meta(ge=0.0, le=1e6)] | None = (
+        EnsembleConfig.state_margin
+    )
     """Imagined states may leave the range of the data by this share; None: free."""
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainingNumbers:
+class TrainingConfig:
     """A fit: `training` and `tuning` after every trial, `refit` before phase 2."""
 
-    num_epochs: int = number(5, 0, 10_000)
+    num_epochs: Annotated[int, Meta(ge=0, le=10_000)] = FitConfig.num_epochs
     """Passes over all data; refit: 0 goes on with the model as it was explored."""
-    batch_size: int = number(32, 1, 65_536)
+    batch_size: Annotated[int, Meta(ge=1, le=65_536)] = FitConfig.batch_size
     """Rows per member and gradient step."""
-    learning_rate: float = number(1e-3, 1e-9, 1.0)
+    learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
     """Of Adam."""
-    final_rate: float = number(1.0, 0.0, 1.0)
+    final_rate: Annotated[float, Meta(ge=0.0, le=1.0)] = FitConfig.final_rate
     """Share of the learning rate that is left at the end of a fit."""
-    bootstrap: bool = True
+    bootstrap: bool = FitConfig.bootstrap
     """Every member sees its own draw of the rows; otherwise all of them."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PlannerNumbers:
+class PlannerConfig:
     """The search at every step; `planner` explores, `task_planner` performs tasks."""
 
     optimizer: Literal["cem", "icem", "mppi"] = "cem"
     """How action sequences are searched."""
-    horizon: int = number(30, 1, 1000)
+    horizon: Annotated[int, Meta(ge=1, le=1000)] = 30
     """Steps planned ahead."""
-    num_samples: int = number(500, 2, 1_000_000)
+    num_samples: Annotated[int, Meta(ge=2, le=1_000_000)] = 500
     """Candidates per iteration."""
-    num_elites: int = number(50, 2, 1_000_000)
+    num_elites: Annotated[int, Meta(ge=2, le=1_000_000)] = 50
     """Best candidates that shape the next iteration."""
-    num_iterations: int = number(5, 1, 100)
+    num_iterations: Annotated[int, Meta(ge=1, le=100)] = 5
     """Iterations per step."""
-    num_particles: int = number(20, 1, 100_000)
+    num_particles: Annotated[int, Meta(ge=1, le=100_000)] = 20
     """Particles per candidate, over all members."""
-    momentum: float = number(0.1, 0.0, 1.0)
+    momentum: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.1
     """Share of the old mean and variance that an iteration keeps."""
     legacy_variance: bool = False
     """cem: leave the variance without momentum, as PETS's code did in 2018."""
-    noise_beta: float = number(2.0, 0.0, 10.0)
+    noise_beta: Annotated[float, Meta(ge=0.0, le=10.0)] = 2.0
     """icem: exponent of the coloured noise; 0 is white."""
-    temperature: float = number(1.0, 1e-6, 1e6)
+    temperature: Annotated[float, Meta(ge=1e-6, le=1e6)] = 1.0
     """mppi: 0.1 follows the few best candidates, 10 averages over all."""
     precision: Literal["f32", "tf32", "bf16"] = "bf16"
     """Of the matrix products while planning, on CPUs with --planner.no-fused only;
@@ -86,170 +110,145 @@ class PlannerNumbers:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """Unsupervised exploration with deep model-based RL on HalfCheetah.
+class Phased:
+    """What is to be done."""
 
-    Phase explore learns a model without a reward, zero-shot uses it for four tasks,
-    finetune goes on learning with their rewards, report makes tables and figures. The
-    same command continues a run that was stopped.
-    """
-
-    phase: Phase
+    phase: Phase = "explore"
     """What to do."""
-    preset: Preset = "laptop"
+
+
+@dataclasses.dataclass(frozen=True)
+class Basics:
+    """The part of the science that one chooses first."""
+
+    preset: Annotated[Preset, EXPLORED, COUNTED] = "laptop"
     """Numbers to start from: minutes on a laptop, the paper's, or seconds."""
-    arm: ArmName = "epistemic"
+    arm: Annotated[ArmName, EXPLORED, COUNTED] = "epistemic"
     """What exploration seeks: disagreement of the ensemble (SU-PETS), rare states
     (count), nothing (random), the forward task (oracle), one-step disagreement,
     information gain, or disagreement in units of the data (best)."""
-    task: TaskName = "all"
-    """For zero-shot and finetune."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: Annotated[tuple[Seed, ...], EXPLORED, COUNTED] = (0,)
     """One run each, side by side in one program; 0 to 2**32 - 1."""
+    engine: EngineName = "mjx"
+    """What steps the physics: mjx on the device of the program, or mujoco, which is C
+    on the cores of the host."""
+    num_trials: Annotated[Trials, EXPLORED, COUNTED] = 60
+    """Exploration trials, the random ones included."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Exploration(Basics):
+    """What phase 1 depends on, and all that follows it."""
+
+    random_trials: Trials = 1
+    """Trials with random actions at the start."""
+    trial_length: Annotated[Steps, EXPLORED] = 1000
+    """Environment steps per exploration trial."""
+    num_bits: Annotated[int, Meta(ge=1, le=32), EXPLORED, COUNTED] = 32
+    """count: bits of the hash."""
+    milestones: Annotated[tuple[int, ...], COUNTED] = (10, 20, 26, 40)
+    """Trials whose checkpoints are kept for good; otherwise the last two are."""
+    model: ModelConfig = ModelConfig()
+    training: TrainingConfig = TrainingConfig()
+    planner: PlannerConfig = PlannerConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """What phase 2 depends on besides."""
+
+    task_length: Steps = 1000
+    """Environment steps per trial of zero-shot and finetune."""
+    eval_trials: Annotated[TaskTrials, COUNTED] = 5
+    """zero-shot: trials per task and seed."""
+    pessimism: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
+    """Standard deviations between members taken off the reward of a task."""
+    refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
+    task_planner: PlannerConfig = PlannerConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """What fine-tuning depends on besides."""
+
+    finetune_trials: Annotated[TaskTrials, COUNTED] = 20
+    """finetune: trials per task and seed."""
+    tuning: TrainingConfig = TrainingConfig(final_rate=0.02)
+
+
+@dataclasses.dataclass(frozen=True)
+class Science(Tuning, Evaluation, Exploration):
+    """Everything that decides about numbers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """Which tasks phase 2 is about, and which variant of it this is."""
+
+    task: TaskName = "all"
+    """The task to perform."""
+    tag: str | None = None
+    """Name of a variant of phase 2, with other numbers: it has a folder of its own in
+    the run, and, if it is a zero-shot, a row of its own in the report."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run(Variant, Science, Phased):
+    """What a run is: where these are equal, it is the same one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """Where runs are."""
+
     out: Path = Path("runs")
     """Folder of all runs."""
     name: str | None = None
     """Name of the exploration run; by default PRESET-ARM."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """What phase 2 starts from, and its video."""
+
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """Exploration run for zero-shot and finetune; by default OUT/NAME."""
+    """The exploration run to start from; by default OUT/NAME."""
     at_trial: int | None = None
     """Use the explored model as it was after this trial; by default the last."""
-    tag: str | None = None
-    """Name of another attempt at phase 2, with other numbers: it has a folder of its
-    own in the run, and, if it is a zero-shot, a row of its own in the report."""
     video: Path | None = None
-    """Render a trial of each task to this mp4 (zero-shot and finetune)."""
-    num_trials: int = number(60, 1, 100_000)
-    """Exploration trials, the random ones included."""
-    random_trials: int = number(1, 1, 100_000)
-    """Trials with random actions at the start."""
-    trial_length: int = number(1000, 1, 1_000_000)
-    """Environment steps per exploration trial."""
-    task_length: int = number(1000, 1, 1_000_000)
-    """Environment steps per trial of zero-shot and finetune."""
-    eval_trials: int = number(5, 1, 10_000)
-    """zero-shot: trials per task and seed."""
-    finetune_trials: int = number(20, 1, 10_000)
-    """finetune: trials per task and seed."""
-    chunk_length: int = number(50, 1, 1_000_000)
+    """Render a trial of each task to this mp4."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Compute:
+    """How much is computed at a time; no number depends on it."""
+
+    chunk_length: Steps = 50
     """Environment steps per call of the compiled program."""
-    milestones: tuple[int, ...] = (10, 20, 26, 40)
-    """Trials whose checkpoints are kept for good; otherwise the last two are."""
-    engine: EngineName = "mjx"
-    """What steps the physics: mjx on the device of the program, or mujoco, which is C
-    on the cores of the host."""
-    pessimism: float = number(0.0, 0.0, 100.0)
-    """Performing: standard deviations between members taken off a task's reward."""
-    num_bits: int = number(32, 1, 32)
-    """count: bits of the hash."""
+    allow_cpu: bool = False
+    """Start on a CPU although planning would take over an hour."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Process:
+    """Which process of how many this is."""
+
     coordinator_address: str | None = None
     """HOST:PORT of process 0, where several processes share the seeds; the same command
     on each. auto: as SLURM, Open MPI or Kubernetes say, a process per GPU."""
-    num_processes: int | None = number(None, 1, 100_000)
+    num_processes: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     """How many processes share the seeds."""
-    process_id: int | None = number(None, 0, 99_999)
+    process_id: Annotated[int, Meta(ge=0, le=99_999)] | None = None
     """Which of them this is; only the folder of process 0 is used."""
-    allow_cpu: bool = False
-    """Start on a CPU although planning would take over an hour."""
     debug: bool = False
     """Show tracebacks."""
-    model: ModelNumbers = ModelNumbers()
-    training: TrainingNumbers = TrainingNumbers()
-    refit: TrainingNumbers = TrainingNumbers(400, 128, final_rate=0.005)
-    tuning: TrainingNumbers = TrainingNumbers(final_rate=0.02)
-    planner: PlannerNumbers = PlannerNumbers()
-    task_planner: PlannerNumbers = PlannerNumbers()
 
 
-def validate(config: Config) -> None:
-    """Checks all numbers and combinations.
-
-    Raises:
-      UsageError: naming the flag, the value and what would be valid.
-    """
-    _check_ranges(config, "--")
-    for seed in config.seeds:
-        _require(0 <= seed < 2**32, "--seeds", seed, "0 to 4294967295")
-    unique = 0 < len(config.seeds) == len(set(config.seeds))
-    _require(unique, "--seeds", config.seeds, "one or more different seeds")
-    _check_planner("--planner", config.planner, config.model)
-    _check_planner("--task-planner", config.task_planner, config.model)
-    for name in ("training", "tuning"):
-        epochs = getattr(config, name).num_epochs
-        _require(epochs > 0, f"--{name}.num-epochs", epochs, "1 to 10,000")
-    members = config.model.num_members
-    _require(
-        members >= 2 or config.arm in ("count", "random", "oracle"),
-        "--model.num-members",
-        members,
-        f"2 or more for --arm {config.arm}; one member never disagrees",
-    )
-    _require(
-        members >= 2 or not config.pessimism,
-        "--pessimism",
-        config.pessimism,
-        "0 with one member; it never disagrees",
-    )
-    random, trials = config.random_trials, config.num_trials
-    valid = f"1 to --num-trials ({trials})"
-    _require(random <= trials, "--random-trials", random, valid)
-    for length in (config.trial_length, config.task_length):
-        divides = length % config.chunk_length == 0
-        valid = f"a divisor of the length of a trial ({length})"
-        _require(divides, "--chunk-length", config.chunk_length, valid)
-    if config.phase == "explore":
-        later = "left out in explore; it is for zero-shot and finetune"
-        _require(config.source is None, "--from", config.source, later)
-        _require(config.at_trial is None, "--at-trial", config.at_trial, later)
-        _require(config.tag is None, "--tag", config.tag, later)
-        _require(config.task == "all", "--task", config.task, later)
-    if config.video is not None:
-        good = config.video.suffix == ".mp4" and config.phase in (
-            "zero-shot",
-            "finetune",
-        )
-        _require(good, "--video", config.video, "a .mp4 file, in zero-shot or finetune")
+@dataclasses.dataclass(frozen=True)
+class Config(Process, Compute, Origin, Output, Run):
+    """One command: what a run is, and where and how it is computed."""
 
 
-def _check_planner(flag: str, planner: PlannerNumbers, model: ModelNumbers) -> None:
-    _require(
-        planner.num_elites <= planner.num_samples or planner.optimizer == "mppi",
-        f"{flag}.num-elites",
-        planner.num_elites,
-        f"2 to {flag}.num-samples ({planner.num_samples})",
-    )
-    _require(
-        planner.num_particles % model.num_members == 0,
-        f"{flag}.num-particles",
-        planner.num_particles,
-        f"a multiple of --model.num-members ({model.num_members})",
-    )
-
-
-def ranges(config: Any, prefix: str = "--") -> dict[str, str]:
-    """Returns, per flag of a number, what is valid in words."""
-    found = {}
-    for field in dataclasses.fields(config):
-        flag = prefix + field.name.replace("_", "-")
-        if dataclasses.is_dataclass(value := getattr(config, field.name)):
-            found |= ranges(value, f"{flag}.")
-        elif "range" in field.metadata:
-            low, high = field.metadata["range"]
-            found[flag] = f"{low:,} to {high:,}"
-    return found
-
-
-def _check_ranges(config: Any, prefix: str) -> None:
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        flag = prefix + field.name.replace("_", "-")
-        if dataclasses.is_dataclass(value):
-            _check_ranges(value, f"{flag}.")
-        elif "range" in field.metadata and value is not None:
-            low, high = field.metadata["range"]
-            _require(low <= value <= high, flag, value, f"{low:,} to {high:,}")
-
-
-def _require(holds: bool, flag: str, value: Any, valid: str) -> None:
-    if not holds:
-        raise UsageError(f"{flag} {value} is not valid; it must be {valid}.")
+def part(config: Any, role: Any) -> Any:
+    """Returns the fields of `config` that a dataclass, `role`, has too, as one."""
+    return role(**{f.name: getattr(config, f.name) for f in dataclasses.fields(role)})

@@ -2,18 +2,16 @@
 
 import dataclasses
 
-import tyro
-
 from experiments.config import (
     ArmName,
     Config,
-    ModelNumbers,
-    PlannerNumbers,
+    ModelConfig,
+    PlannerConfig,
     Preset,
-    TrainingNumbers,
+    TrainingConfig,
 )
 
-_LAPTOP_PLANNER = PlannerNumbers(
+_LAPTOP_PLANNER = PlannerConfig(
     optimizer="icem",
     horizon=15,
     num_samples=64,
@@ -23,7 +21,7 @@ _LAPTOP_PLANNER = PlannerNumbers(
     noise_beta=1.0,
     precision="f32",
 )
-_SMOKE_PLANNER = PlannerNumbers(
+_SMOKE_PLANNER = PlannerConfig(
     horizon=3,
     num_samples=8,
     num_elites=2,
@@ -35,9 +33,8 @@ _SMOKE_PLANNER = PlannerNumbers(
 # third as large, and trains longer on the little data there is, so that nothing is left
 # for a refit. Many short trials beat few long ones.
 PRESETS = {
-    "paper": Config(tyro.MISSING, preset="paper"),
+    "paper": Config(preset="paper"),
     "laptop": Config(
-        tyro.MISSING,
         preset="laptop",
         num_trials=48,
         trial_length=250,
@@ -46,15 +43,14 @@ PRESETS = {
         finetune_trials=3,
         chunk_length=10,
         milestones=(),
-        model=ModelNumbers(hidden_size=128, num_layers=3),
-        training=TrainingNumbers(20, 64, 2e-3),
-        refit=TrainingNumbers(0),
-        tuning=TrainingNumbers(20, 64, 2e-3, final_rate=0.02),
+        model=ModelConfig(hidden_size=128, num_layers=3),
+        training=TrainingConfig(20, 64, 2e-3),
+        refit=TrainingConfig(0),
+        tuning=TrainingConfig(20, 64, 2e-3, final_rate=0.02),
         planner=_LAPTOP_PLANNER,
         task_planner=dataclasses.replace(_LAPTOP_PLANNER, noise_beta=0.5),
     ),
     "smoke": Config(
-        tyro.MISSING,
         preset="smoke",
         num_trials=3,
         trial_length=20,
@@ -63,10 +59,10 @@ PRESETS = {
         finetune_trials=2,
         chunk_length=10,
         milestones=(),
-        model=ModelNumbers(num_members=3, hidden_size=16, num_layers=2),
-        training=TrainingNumbers(1, 16),
-        refit=TrainingNumbers(0),
-        tuning=TrainingNumbers(1, 16),
+        model=ModelConfig(num_members=3, hidden_size=16, num_layers=2),
+        training=TrainingConfig(1, 16),
+        refit=TrainingConfig(0),
+        tuning=TrainingConfig(1, 16),
         planner=_SMOKE_PLANNER,
         task_planner=_SMOKE_PLANNER,
     ),
@@ -77,12 +73,12 @@ PRESETS = {
 PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
 # How `best` performs: a longer refit, of every member on every row, and a search from
 # fewer elites in noise that keeps its direction for a while.
-_BEST_REFIT = TrainingNumbers(800, 256, final_rate=0.005, bootstrap=False)
-_BEST_SEARCH = PlannerNumbers(optimizer="icem", num_elites=25, noise_beta=0.5)
+_BEST_REFIT = TrainingConfig(800, 256, final_rate=0.005, bootstrap=False)
+_BEST_SEARCH = PlannerConfig(optimizer="icem", num_elites=25, noise_beta=0.5)
 
 
-def numbers_of(preset: Preset, arm: ArmName) -> Config:
-    """Returns the numbers to start from; `best` brings some of its own to `paper`."""
+def preset_config(preset: Preset, arm: ArmName) -> Config:
+    """Returns what to start from; `best` brings some numbers of its own to `paper`."""
     config = PRESETS[preset]
     if (preset, arm) == ("paper", "best"):
         config = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""`python -m experiments.run --phase {explore,zero-shot,finetune,report}`."""
+"""`python -m experiments.run {explore,zero-shot,finetune,report}`: the command line."""
 
 import os
 import sys
@@ -8,7 +8,9 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from experiments import cli, session
-from experiments.config import NUM_TASKS, Config, PlannerNumbers
+from experiments.config import Config
+from experiments.cost import check_cpu, memory_advice
+from experiments.entries import from_json, to_json
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -18,7 +20,6 @@ from experiments.errors import (
     UsageError,
 )
 from experiments.parallel import distributed
-from experiments.presets import PRESETS
 from experiments.progress import stoppable
 
 
@@ -32,9 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-        with distributed.joined(cli.place(arguments), _say):
-            plain = distributed.on_first(lambda: cli.to_json(cli.parse(arguments)))
-            config = cli.from_json(plain, PRESETS["smoke"])
+        with distributed.joined(cli.process_spec(arguments), _say):
+            plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
+            config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config)
     except RunError as error:
@@ -54,12 +55,12 @@ def _dispatch(config: Config) -> None:
             _say(f"wrote {path}")
         return
     source = cli.explored_run(config)
-    _check_cpu(config)
+    check_cpu(config)
     if config.phase == "explore":
         _explore(config, source)
         return
     step = distributed.on_first(lambda: _explored_step(config, source))
-    folder = cli.results_folder(config) / _attempt(config, step)
+    folder = cli.results_folder(config) / _variant(config, step)
     with _without_gl(), stoppable(), _opened(config, folder):
         from experiments import phases
 
@@ -69,7 +70,7 @@ def _dispatch(config: Config) -> None:
         _video(config, folder)
 
 
-def _attempt(config: Config, step: int) -> str:
+def _variant(config: Config, step: int) -> str:
     """Returns the name of the folder of a later phase: zero-shot-060-forward-TAG."""
     task = [config.task] if config.task != "all" else []
     tag = [config.tag] if config.tag else []
@@ -86,7 +87,7 @@ def _explore(config: Config, folder: Path) -> None:
 
 def _opened(config: Config, folder: Path) -> AbstractContextManager[None]:
     """Returns what holds a run's folder, on the process that has one."""
-    run = session.open_run(folder, cli.to_json(config), ignore=cli.CONTINUED, say=_say)
+    run = session.open_run(folder, to_json(config), say=_say)
     return distributed.held_by_first(run)
 
 
@@ -129,39 +130,19 @@ def _video(config: Config, folder: Path) -> None:
         _say(f"wrote {target}")
 
 
-def _check_cpu(config: Config) -> None:
-    """Refuses what would take over an hour on a CPU by mistake."""
-    import jax
-
-    if jax.default_backend() != "cpu" or config.allow_cpu:
-        return
-    _, planner = _search(config)
-    model = config.model
-    width = model.hidden_size
-    products = 24 * width + (model.num_layers - 1) * width**2 + width * 36
-    rows = planner.num_samples * planner.num_particles * planner.num_iterations
-    steps = _planned_steps(config) * len(config.seeds)
-    hours = 2 * products * rows * planner.horizon * steps / 1e11 / 3600
-    if hours > 1:
-        raise UsageError(
-            f"--phase {config.phase} of --preset {config.preset} would take about "
-            f"{hours:.0f} hours on this CPU; use a GPU, smaller numbers or --allow-cpu."
-        )
-
-
 @contextmanager
 def _plain_errors(config: Config) -> Iterator[None]:
     """Turns what the system says about memory and disk into one line."""
     try:
         yield
     except MemoryError as error:
-        raise OutOfMemoryError(_memory_advice(config)) from error
+        raise OutOfMemoryError(memory_advice(config)) from error
     except OSError as error:
         raise StorageError(f"{error.strerror} ({error.filename}).") from error
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        raise OutOfMemoryError(_memory_advice(config)) from error
+        raise OutOfMemoryError(memory_advice(config)) from error
 
 
 @contextmanager
@@ -178,43 +159,6 @@ def _without_gl() -> Iterator[None]:
         del os.environ["MUJOCO_GL"]
         if chosen is not None:
             os.environ["MUJOCO_GL"] = chosen
-
-
-def _memory_advice(config: Config) -> str:
-    flag, planner = _search(config)
-    trials = _num_tasks(config)
-    flags = ["--seeds", f"--{flag}.num-samples", f"--{flag}.num-particles"]
-    if config.phase == "zero-shot":
-        trials *= config.eval_trials
-        flags.insert(1, "--eval-trials")
-    return (
-        f"out of memory. {len(config.seeds)} seeds x {trials} trials x "
-        f"{planner.num_samples} samples x {planner.num_particles} particles x horizon "
-        f"{planner.horizon} are planned at once; lower one of {', '.join(flags)}. The "
-        "last checkpoint is intact."
-    )
-
-
-def _search(config: Config) -> tuple[str, PlannerNumbers]:
-    """Returns the search of a phase, and what its flags are called."""
-    if config.phase == "explore":
-        return "planner", config.planner
-    return "task-planner", config.task_planner
-
-
-def _num_tasks(config: Config) -> int:
-    """Returns how many tasks are planned for at once; exploration is one."""
-    return NUM_TASKS if config.phase != "explore" and config.task == "all" else 1
-
-
-def _planned_steps(config: Config) -> int:
-    """Returns how many steps of environments a seed plans for in a phase."""
-    if config.phase == "explore":
-        planned = config.num_trials - config.random_trials
-        return planned * config.trial_length if config.arm != "random" else 0
-    zero_shot = config.phase == "zero-shot"
-    trials = config.eval_trials if zero_shot else config.finetune_trials
-    return _num_tasks(config) * trials * config.task_length
 
 
 def _say(text: str) -> None:

@@ -1,14 +1,13 @@
 """A run's folder for as long as the run lasts: locked, described, and accounted for."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from experiments import cli
 from experiments.config import NUM_TASKS
+from experiments.entries import differences
 from experiments.errors import CheckpointError, InterruptedRun, RunError
-from experiments.presets import PRESETS
 from experiments.storage import rundir
 
 # Two checkpoints and one being written, of a paper-sized run of one seed and task.
@@ -20,7 +19,6 @@ def open_run(
     folder: Path,
     config: dict[str, Any],
     *,
-    ignore: Sequence[str],
     say: Callable[[str], None],
 ) -> Iterator[None]:
     """Holds a run's folder: config.json, env.json, status.json and the lock.
@@ -28,7 +26,6 @@ def open_run(
     Args:
       folder: made if it is not there.
       config: in JSON; must equal what the folder was started with.
-      ignore: entries of the config that may differ.
       say: for warnings.
 
     Raises:
@@ -40,7 +37,7 @@ def open_run(
         branches *= NUM_TASKS
     rundir.probe(folder, _NEEDED_BYTES * branches)
     with rundir.lock(folder):
-        _compare(folder / "config.json", config, ignore)
+        _compare(folder / "config.json", config)
         environment = rundir.environment()
         if (folder / "env.json").exists():
             old = rundir.read_json(folder / "env.json")
@@ -63,10 +60,9 @@ def open_run(
         _status(folder, "complete")
 
 
-def _compare(path: Path, config: dict[str, Any], ignore: Sequence[str]) -> None:
+def _compare(path: Path, config: dict[str, Any]) -> None:
     if path.exists():
-        default = cli.to_json(PRESETS["paper"])  # Config's own defaults
-        lines = cli.differences(rundir.read_json(path), config, ignore, default)
+        lines = differences(rundir.read_json(path), config)
         if lines:
             another = "--name" if config["phase"] == "explore" else "--tag"
             raise CheckpointError(

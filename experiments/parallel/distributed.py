@@ -21,7 +21,7 @@ from experiments.errors import OutOfMemoryError, RunError, UsageError
 from experiments.storage.pytrees import describe, from_host, to_host
 
 
-class Place(NamedTuple):
+class ProcessSpec(NamedTuple):
     """This process among the others; None is for jax to find out."""
 
     coordinator_address: str | None
@@ -30,23 +30,23 @@ class Place(NamedTuple):
 
 
 @contextlib.contextmanager
-def joined(place: Place | None, say: Callable[[str], None]) -> Iterator[None]:
+def joined(spec: ProcessSpec | None, say: Callable[[str], None]) -> Iterator[None]:
     """Makes this process one of several for a while; None leaves it alone.
 
     Raises:
       UsageError: if jax cannot tell where the others are. If they are not there within
         five minutes, it ends the process.
     """
-    if place is None:
+    if spec is None:
         yield
         return
     say("waiting for the other processes, at most 5 minutes.")
     # It would catch SIGTERM, which is a run's own to handle.
     jax.config.update("jax_enable_preemption_service", False)
     # A cluster is asked for the place only: it would also give us one device of many.
-    detect = "deactivate" if place.coordinator_address else None
+    detect = "deactivate" if spec.coordinator_address else None
     try:
-        jax.distributed.initialize(*place, cluster_detection_method=detect)
+        jax.distributed.initialize(*spec, cluster_detection_method=detect)
     except (RuntimeError, ValueError) as error:
         why = str(error).partition("\n")[0].rstrip(".")
         raise UsageError(

@@ -7,19 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.config import Config, Evaluation, Exploration, Mark, Tuning
+from experiments.entries import entries
 from experiments.report.logs import Row, Scores, number, read_json
 from experiments.report.tables import ARMS, TASKS, flat, in_order
 
-# Entries of a config that say what to run and where, not how.
-_NOT_SETTINGS = {
-    "phase", "arm", "preset", "seeds", "task", "out", "name", "source", "at_trial",
-    "tag", "video", "milestones", "allow_cpu", "debug", "chunk_length", "eval_trials",
-    "num_trials", "finetune_trials", "num_bits",
-}  # fmt: skip
-# What a phase keeps in its config for the phases after it.
-_FOR_LATER = {
-    "explore": {"task_length", "refit", "tuning", "task_planner", "pessimism"},
-    "zero-shot": {"tuning"},
+# What a phase depends on; the rest it keeps in its config for the phases after it.
+_DEPENDS_ON = {
+    "explore": (Exploration,),
+    "zero-shot": (Exploration, Evaluation),
+    "finetune": (Exploration, Evaluation, Tuning),
 }
 
 
@@ -135,14 +132,14 @@ def _torn(runs: Iterable[Path]) -> Iterator[str]:
 def _unequal(runs: dict[Path, str]) -> Iterator[str]:
     """Says which settings differ between runs of a phase that share a table."""
     for phase in sorted(set(runs.values())):
-        skipped = _NOT_SETTINGS | _FOR_LATER.get(phase, set())
+        settings = _settings(phase)
         values: dict[str, dict[str, set[str]]] = {}
         labels = set()
         for run in sorted(run for run in runs if runs[run] == phase):
             label = run.parent.name if phase != "explore" else run.name
             labels.add(label)
             for name, value in flat(read_json(run / "config.json")).items():
-                if name.split(".")[0] not in skipped:
+                if settings.get(name, True):
                     by_value = values.setdefault(name, {})
                     by_value.setdefault(str(value), set()).add(label)
         for name, by_value in values.items():
@@ -153,3 +150,12 @@ def _unequal(runs: dict[Path, str]) -> Iterator[str]:
                     f"{v} ({_list(sorted(r))})" for v, r in by_value.items()
                 )
                 yield f"Unequal settings in {phase}: {name} is {each}."
+
+
+def _settings(phase: str) -> dict[str, bool]:
+    """Tells of every entry of a config if it says how the numbers of a phase came."""
+    found = dict.fromkeys((entry.name for entry in entries(Config)), False)
+    for role in _DEPENDS_ON[phase]:
+        for entry in entries(role):
+            found[entry.name] = Mark.COUNTED not in entry.marks
+    return found

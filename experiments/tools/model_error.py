@@ -26,9 +26,10 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from experiments import cli, phases
+from experiments import phases
 from experiments.build import build
 from experiments.config import Config
+from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
 from experiments.presets import PRESETS
 from experiments.report import logs, tables
@@ -66,7 +67,7 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     if num_rows < 1:
         raise UsageError(f"--rows {num_rows} is not valid; it must be 1 or more.")
     configs = [
-        cli.from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
+        from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
         for run in runs
     ]
     labels = [_label(config) for config in configs]
@@ -94,7 +95,7 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
 
 
 def _label(config: Config) -> str:
-    return logs.label(config.arm, cli.to_json(config))
+    return logs.label(config.arm, to_json(config))
 
 
 def _check_comparable(

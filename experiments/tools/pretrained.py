@@ -20,6 +20,7 @@ import jax
 from experiments import cli, phases
 from experiments.build import build
 from experiments.config import Config
+from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
 from experiments.presets import PRESETS, PRETRAINED_PLANNER
 from experiments.report import logs
@@ -42,7 +43,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     folder = cli.PRETRAINED / name
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
-    config = cli.from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
+    config = from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
     seed = config.seeds[0] if seed is None else seed
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
@@ -59,7 +60,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
         task_planner=PRETRAINED_PLANNER,
     )
     checkpoint.save(folder / "checkpoints", step, state, {}, finite=state)
-    rundir.write_json(folder / "config.json", cli.to_json(shipped))
+    rundir.write_json(folder / "config.json", to_json(shipped))
     shutil.copyfile(run / "env.json", folder / "env.json")
     for file in ("config.json", "env.json"):  # how the model came to be what it is
         shutil.copyfile(performed / file, folder / f"performed-{file}")

@@ -18,7 +18,7 @@ import tyro
 import jaxpets
 from experiments import acting
 from experiments.build import ENGINES, optimizer
-from experiments.config import EngineName, PlannerNumbers
+from experiments.config import EngineName, PlannerConfig
 from experiments.presets import PRETRAINED_PLANNER
 from experiments.storage import rundir
 from jaxpets.envs import env_rollout, half_cheetah
@@ -38,7 +38,7 @@ class Arguments:
     """What steps the physics, imagined and real."""
     json: Path | None = None
     """Appends a row per trial to this file."""
-    task_planner: PlannerNumbers = PRETRAINED_PLANNER
+    task_planner: PlannerConfig = PRETRAINED_PLANNER
     """By default the search of the models that come with the code."""
 
 

@@ -14,8 +14,9 @@ import toys
 
 import jaxpets
 from benchmarks import accuracy, workloads
-from experiments import cli, phases
+from experiments import phases
 from experiments.build import build
+from experiments.entries import to_json
 from experiments.presets import PRESETS
 from experiments.storage import checkpoint, rundir
 from jaxpets.envs import half_cheetah
@@ -68,7 +69,7 @@ def performed(tmp_path_factory):
         planner=search,
         task_planner=search,
     )
-    rundir.write_json(folder / "config.json", cli.to_json(config))
+    rundir.write_json(folder / "config.json", to_json(config))
     keys = jax.random.split(jax.random.key(0), 2)
     size = dataclasses.replace(SIZE, hidden_sizes=(16, 16))
     params = jax.jit(jax.vmap(functools.partial(workloads.params, size)))(keys)

@@ -7,7 +7,8 @@ import pytest
 
 from experiments import cli
 from experiments.config import Config
-from experiments.errors import CheckpointError, OutOfMemoryError
+from experiments.entries import to_json
+from experiments.errors import OutOfMemoryError
 from experiments.presets import PRESETS
 from experiments.run import _plain_errors, main
 
@@ -41,110 +42,86 @@ def explored(out, name="smoke-epistemic", **changes):
     config = dataclasses.replace(PRESETS["smoke"], phase="explore", **changes)
     (out / name).mkdir(parents=True)
     path = out / name / "config.json"
-    path.write_text(json.dumps(cli.to_json(config)))
+    path.write_text(json.dumps(to_json(config)))
     return path
 
 
-EPOCHS = ["--tuning.num-epochs 0", "1 to 10,000"]
-TRIALS = ["--num-trials", "1 to 100,000"]
-ELITES = ["--planner.num-elites", "9", "2 to --planner.num-samples (8)"]
-AT = ("--coordinator-address", "host:1")
-AUTO = (AT[0], "auto")
-RATE = ["--training.learning-rate", "1e-09 to 1.0"]
+# Command lines, after those of SMOKE where they begin with a flag, and what is said.
+WRONG = """
+fly --preset smoke                      | --phase fly; finetune
+report --num-trails 3                   | --num-trails is not a flag
+report                                  | metrics.jsonl
+report --coordinator-address auto       | --coordinator-address auto; in report
+explore --preset paper                  | --preset paper; hours; --allow-cpu
+--phase                                 | --phase with no value; explore, zero-shot
+--phase fly                             | --phase fly; finetune
+--preset huge                           | --preset huge; laptop, paper, smoke
+--arm x                                 | --arm x; one-step
+--num-trails 3                          | --num-trails is not a; Perhaps --num-trials?
+--num_trails=3                          | --num_trails is not a; Perhaps --num-trials?
+--allow-cpu=true                        | true is not a flag
+--allow-cpu extra                       | extra is not a flag
+--num-trials                            | --num-trials with no value; 1 to 100,000
+--num_trials=0                          | --num-trials 0; 1 to 100,000
+--num-trials -1                         | --num-trials -1; 1 to 100,000
+--num-trials 1e9                        | --num-trials 1e9; 1 to 100,000
+--num-trials 2.5                        | --num-trials 2.5; 1 to 100,000
+--num-trials nan                        | --num-trials nan; 1 to 100,000
+--training.learning-rate nan            | learning-rate nan; 1e-09 to 1.0
+--model.state-margin inf                | state-margin inf; 0.0 to 1,000,000.0 or None
+--tuning.num-epochs 0                   | --tuning.num-epochs 0; 1 to 10,000
+--seeds                                 | --seeds (); one or more different
+--seeds 0 -1                            | --seeds 0 -1; 0 to 4,294,967,295
+--seeds 0 0                             | --seeds (0, 0); different
+--planner.num-elites 9                  | --planner.num-elites 9; num-samples (8)
+--task-planner.num-particles 4          | --task-planner.num-particles 4; multiple; (3)
+--model.num-members 1                   | members 1; 2 or more for --arm epistemic
+--arm random --model.num-members 1 --pessimism 1 | --pessimism 1.0; 0 with one member
+--random-trials 4                       | --random-trials 4; --num-trials (3)
+--chunk-length 7                        | --chunk-length 7; divisor; (20)
+--task forward                          | --task forward; left out in explore
+--tag x                                 | --tag x; it is for zero-shot and finetune
+--from there                            | --from there; left out in explore
+--at-trial 2                            | --at-trial 2; left out in explore
+--video a.mp4                           | --video a.mp4; left out in explore
+--phase zero-shot --arm x               | --arm x; one-step
+--phase zero-shot --task swim           | --task swim; back-flip
+--phase zero-shot --name ../x           | --name; '../x'; at most 64
+--num-processes 2                       | --num-processes 2; left out, unless
+--process-id 0                          | --process-id 0; left out, unless
+--coordinator-address auto --process-id 0 | --process-id 0; left out, unless
+--coordinator-address host              | address host is; HOST:PORT or auto
+--coordinator-address :1                | address :1 is; HOST:PORT or auto
+--coordinator-address h:123456          | address h:123456 is; HOST:PORT or auto
+--coordinator-address h:1               | --num-processes None; 1 or more
+--coordinator-address h:1 --num-processes 0 | --num-processes 0; 1 to 100,000
+--coordinator-address h:1 --num-processes 2 | --process-id None; 0 to; (2)
+--coordinator-address h:1 --num-processes 2 --process-id 2 | --process-id 2; 0 to; (2)
+"""
+
+
+@pytest.mark.parametrize("case", WRONG.strip().splitlines(), ids=lambda case: case)
+def test_bad_usage_is_one_line_before_anything_is_created(fail, out, case):
+    flags, _, words = case.partition("|")
+    code, line = fail(*(SMOKE if flags.startswith("-") else ()), *flags.split())
+    assert code == 2
+    assert all(word.strip() in line for word in words.split(";"))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        ((), ["--phase", "explore,zero-shot,finetune,report"]),
-        (("--phase",), ["--phase"]),
-        (("--phase", "fly"), ["--phase", "'fly'", "'finetune'"]),
-        ((*SMOKE, "--preset", "huge"), ["--preset", "huge", "paper, laptop, smoke"]),
-        ((*SMOKE, "--preset"), ["--preset", "paper, laptop, smoke"]),
-        ((*SMOKE, "--arm", "x"), ["--arm", "'x'", "'one-step'"]),
-        ((*SMOKE, "--engine", "warp"), ["--engine", "'warp'", "'mujoco'"]),
-        ((*SMOKE, "--task", "swim"), ["--task", "'swim'", "'back-flip'"]),
-        ((*LATER, "--arm", "x"), ["--arm", "'x'", "'one-step'"]),
-        ((*SMOKE, "--num-trails", "3"), ["--num-trails", "Perhaps", "--num-trials"]),
-        ((*SMOKE, "--num_trails", "3"), ["--num_trails", "Perhaps", "--num-trials"]),
-        ((*SMOKE, "extra"), ["extra"]),
-        *[((*SMOKE, "--num-trials", v), [v, *TRIALS]) for v in ("0", "-1", "100001")],
-        *[
-            ((*SMOKE, "--num-trials", v), [v, *TRIALS])
-            for v in ("abc", "nan", "inf", "1e9", "2.5")
-        ],
-        ((*SMOKE, "--num-trials"), TRIALS[:1]),
-        ((*SMOKE, "--tuning.num-epochs", "0"), EPOCHS),
-        ((*SMOKE, "--num_trials=0"), TRIALS),
-        ((*SMOKE, "--seeds"), ["--seeds", "one or more different"]),
-        ((*SMOKE, "--seeds", "-1"), ["--seeds", "-1", "0 to 4294967295"]),
-        ((*SMOKE, "--seeds", "4294967296"), ["--seeds 4294967296", "0 to 4294967295"]),
-        ((*SMOKE, "--seeds", "0", "0"), ["--seeds", "(0, 0)", "different"]),
-        ((*SMOKE, "--planner.num-elites", "9"), ELITES),
-        ((*SMOKE, "--planner.num-elites", "1"), [ELITES[0], "1", "2 to 1,000,000"]),
-        (
-            (*SMOKE, "--task-planner.num-particles", "4"),
-            ["--task-planner.num-particles 4", "multiple", "(3)"],
-        ),
-        ((*SMOKE, "--planner.optimizer", "sgd"), ["--planner.optimizer", "'icem'"]),
-        (
-            (*SMOKE, "--model.num-members", "1"),
-            ["--model.num-members 1", "2 or more for --arm epistemic"],
-        ),
-        (
-            (*SMOKE, "--arm", "random", "--model.num-members", "1", "--pessimism", "1"),
-            ["--pessimism 1.0", "0 with one member"],
-        ),
-        ((*SMOKE, "--random-trials", "4"), ["--random-trials 4", "--num-trials (3)"]),
-        ((*SMOKE, "--chunk-length", "7"), ["--chunk-length 7", "divisor", "(20)"]),
-        ((*SMOKE, "--num-bits", "33"), ["--num-bits 33", "1 to 32"]),
-        *[
-            ((*SMOKE, "--training.learning-rate", v), [v, *RATE])
-            for v in ("0", "-1", "nan", "inf", "x")
-        ],
-        ((*SMOKE, "--model.state-margin", "nan"), ["--model.state-margin", "nan"]),
-        ((*SMOKE, "--model.state-margin", "inf"), ["--model.state-margin", "inf"]),
-        *[
-            ((*SMOKE, f"--name={name}"), ["--name", repr(name), "letters, digits"])
-            for name in ("a/b", "..", ".", "", "-x", "/etc/x", "a\0b", "a ", "a\nb")
-        ],
-        ((*SMOKE, "--name", "a" * 300), ["--name", "aaa...", "at most 64"]),
-        ((*LATER, "--name", "../x"), ["--name", "'../x'", "at most 64"]),
-        ((*SMOKE, "--video", "a.mp4"), ["--video a.mp4", "zero-shot or finetune"]),
-        ((*SMOKE, "--at-trial", "2"), ["--at-trial 2", "zero-shot and finetune"]),
-        ((*SMOKE, "--tag", "x"), ["--tag x", "zero-shot and finetune"]),
-        ((*SMOKE, "--task", "forward"), ["--task forward", "zero-shot and finetune"]),
-        ((*SMOKE, "--from", "there"), ["--from there", "zero-shot and finetune"]),
-        (
-            ("--phase", "explore", "--preset", "paper"),
-            ["--preset paper", "hours", "--allow-cpu"],
-        ),
-        (("--phase", "report"), ["metrics.jsonl"]),
-        ((*SMOKE, "--num-processes", "2"), ["--num-processes 2", "left out, unless"]),
-        ((*SMOKE, "--process-id", "0"), ["--process-id 0", "left out, unless"]),
-        ((*SMOKE, *AUTO, "--num-processes", "2"), ["--num-processes 2", "left out"]),
-        ((*SMOKE, *AT[:1], "host"), [AT[0], "host is not", "HOST:PORT or auto"]),
-        ((*SMOKE, *AT[:1], ":1"), [AT[0], "HOST:PORT or auto"]),
-        ((*SMOKE, *AT[:1], "h:123456"), [AT[0], "HOST:PORT or auto"]),
-        ((*SMOKE, *AT), ["--num-processes None", "1 or more", AT[0]]),
-        ((*SMOKE, *AT, "--num-processes", "x"), ["--num-processes", "1 to 100,000"]),
-        *[
-            (
-                (*SMOKE, *AT, "--num-processes", "2", *own),
-                [" ".join(own), "0 to", "(2)"],
-            )
-            for own in ((), ("--process-id", "2"), ("--process-id", "-1"))
-        ],
-        ((*SMOKE, *AT, "--num-processes", "0"), ["--num-processes 0", "1 or more"]),
-        (("--phase", "report", *AUTO), ["--coordinator-address auto", "in report"]),
-    ],
-    ids=str,
+    "name", ["a/b", "..", ".", "", "-x", "/etc/x", "a\0b", "a ", "a\nb", "a" * 300]
 )
-def test_bad_usage_is_one_line_before_anything_is_created(fail, out, flags, words):
-    code, line = fail(*flags)
-    assert code == 2
-    assert all(word in line for word in words)
+def test_a_name_is_that_of_one_folder(fail, out, name):
+    code, line = fail(*SMOKE, f"--name={name}")
+    assert code == 2 and "--name: run" in line and "at most 64" in line
+    assert (repr(name) if len(name) < 64 else "aaa...'") in line
     assert not out.exists()
+
+
+def test_a_phase_is_needed(fail):
+    code, line = fail("--preset", "smoke")
+    assert code == 2 and "--phase is missing" in line and "explore, zero-shot" in line
 
 
 @pytest.mark.parametrize("phase", ["zero-shot", "finetune"])
@@ -175,6 +152,22 @@ def test_later_phases_take_the_numbers_of_the_run(out):
     assert cli.explored_run(config) == path.parent
 
 
+def test_a_run_gives_its_numbers_and_nothing_else(out, tmp_path):
+    """What a folder that others wrote to may not decide: names, places, a process."""
+    elsewhere = tmp_path / "elsewhere"
+    path = explored(
+        out, chunk_length=5, task="forward", tag="x/../../y", source=elsewhere,
+        at_trial=7, video=elsewhere / "a.mp4", debug=True, coordinator_address="h:1",
+    )  # fmt: skip
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "out": str(elsewhere), "name": "../x"}))
+    config = cli.parse([*LATER, "--out", str(out)])
+    smoke = PRESETS["smoke"]
+    assert config == dataclasses.replace(
+        smoke, phase="zero-shot", out=out, chunk_length=5
+    )
+
+
 def test_from_names_a_run_anywhere(out):
     path = explored(out, name="mine", arm="count", num_bits=16)
     config = cli.parse(["--phase", "finetune", "--from", str(path.parent)])
@@ -199,7 +192,7 @@ def test_a_run_keeps_its_labels(fail, out):
         (("--num-bits", "16"), "--num-bits 16 is not valid; it must be 32"),
         (("--num-trials", "4"), "--num-trials 4 is not valid; it must be 3"),
         (("--model.hidden-size", "8"), "--model.hidden-size 8 is not valid"),
-        (("--tag", "forward"), "--tag forward is not valid; it must not be a task"),
+        (("--tag", "forward"), "--tag forward is not valid; it must be something else"),
         (("--tag", "../x"), "--tag: run '../x' is not a valid name"),
     ],
 )
@@ -213,7 +206,9 @@ def test_a_model_is_called_what_it_is(fail, out, flags, words):
     ("text", "words"),
     [
         ('{"num_trails": 3}', "unknown entry 'num_trails'"),
-        ('{"planner": {"elites": 3}}', "unknown entry 'elites'"),
+        ('{"planner": {"elites": 3}}', "unknown entry 'planner.elites'"),
+        ("[]", "config.json: it is [], not an object"),
+        ('{"model": null}', "config.json: model is None, not an object"),
         ('{"num_trials": NaN}', "NaN"),
         ("{", "line 1, column 2"),
         ("", "cannot be read"),
@@ -223,33 +218,6 @@ def test_a_damaged_config_is_one_line(fail, out, text, words):
     explored(out).write_text(text)
     code, line = fail(*LATER)
     assert code == 3 and words in line
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_configs_survive_json(preset, tmp_path):
-    config = dataclasses.replace(
-        PRESETS[preset], phase="finetune", seeds=(1, 2**32 - 1), video=tmp_path / "a"
-    )
-    data = json.loads(json.dumps(cli.to_json(config)))
-    default = dataclasses.replace(PRESETS["paper"], phase="explore", num_trials=7)
-    assert cli.from_json(data, default) == config
-    del data["num_trials"], data["planner"]["horizon"]
-    older = cli.from_json(data, default)
-    assert older.num_trials == 7 and older.planner.horizon == default.planner.horizon
-    with pytest.raises(CheckpointError, match="unknown entry 'colour'"):
-        cli.from_json({**data, "colour": 1}, default)
-
-
-def test_differences_name_the_field():
-    old = cli.to_json(dataclasses.replace(PRESETS["smoke"], phase="explore"))
-    new = json.loads(json.dumps(old))
-    default = cli.to_json(PRESETS["paper"])
-    assert cli.differences(old, new, (), default) == []
-    new["planner"]["horizon"], new["seeds"], new["debug"] = 5, [1], True
-    assert cli.differences(old, new, ("debug",), default) == [
-        "planner.horizon: 3 (there) vs 5 (now)",
-        "seeds: [0] (there) vs [1] (now)",
-    ]
 
 
 def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
@@ -291,42 +259,6 @@ def test_what_an_older_run_lacks_is_that_of_its_preset_and_arm(out, said):
     assert not config.refit.bootstrap
     assert config.refit.num_epochs == PRESETS["smoke"].refit.num_epochs  # as recorded
     assert config.tuning == PRESETS["paper"].tuning
-
-
-def test_what_an_older_version_did_not_write_was_the_default():
-    default = cli.to_json(dataclasses.replace(PRESETS["paper"], phase="explore"))
-    old = json.loads(json.dumps(default))
-    del old["refit"]["bootstrap"], old["pessimism"], old["tuning"]
-    assert cli.differences(old, default, (), default) == []
-    new = {**default, "pessimism": 3.0}
-    new["refit"] = {**default["refit"], "bootstrap": False}
-    assert cli.differences(old, new, (), default) == [
-        "pessimism: 0.0 (there) vs 3.0 (now)",
-        "refit.bootstrap: True (there) vs False (now)",
-    ]
-    # What only the older one has is nothing this version could do differently.
-    assert cli.differences({**old, "colour": 1}, default, (), default) == []
-
-
-@pytest.mark.parametrize("flags", [(), SMOKE, LATER])
-def test_help_explains_every_flag(flags, out, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([*flags, "--out", str(out), "--help"])
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-
-    def check(config, prefix):
-        for field in dataclasses.fields(config):
-            value = getattr(config, field.name)
-            name = {"source": "from"}.get(field.name, field.name)
-            flag = prefix + name.replace("_", "-")
-            if dataclasses.is_dataclass(value):
-                check(value, f"{flag}.")
-            else:
-                assert flag in text
-
-    check(PRESETS["smoke"], "--")
-    assert "experiments.run" in text
 
 
 def test_laptop_is_the_default():

@@ -2,12 +2,15 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import runs
 
 from experiments import cli
+from experiments.config import Config
+from experiments.presets import PRESETS
 from experiments.run import main
 from experiments.storage import checkpoint
 from experiments.tools import pretrained
@@ -25,7 +28,7 @@ SMALL = (
 def explored(tmp_path_factory):
     """A run that has performed after a refit, with the search of what is shipped."""
     folder = runs.explore(tmp_path_factory.mktemp("explored"), 0)
-    planner = cli.PRESETS["laptop"].task_planner
+    planner = PRESETS["laptop"].task_planner
     search = {
         "optimizer": planner.optimizer,
         "noise-beta": str(planner.noise_beta),
@@ -142,8 +145,9 @@ def test_an_unknown_name_is_an_error(shelf, tmp_path, capsys):
 def test_a_folder_called_pretrained_comes_first(explored, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pretrained").symlink_to(explored)
-    assert cli._found(cli.Path("pretrained")) == cli.Path("pretrained")
-    assert cli._found(cli.Path("pretrained/x")) == cli.PRETRAINED / "x"
+    for name, folder in (("", explored), ("/x", cli.PRETRAINED / "x")):
+        config = Config(source=Path(f"pretrained{name}"))
+        assert cli.explored_run(config) == folder.resolve()
 
 
 @pytest.mark.skipif(not cli.PRETRAINED.exists(), reason="not in this copy of the code")

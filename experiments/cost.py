@@ -1,0 +1,84 @@
+"""What planning costs: operations, hours on a CPU, and memory."""
+
+import itertools
+from collections.abc import Sequence
+
+from experiments.config import NUM_TASKS, Config, PlannerConfig
+from experiments.errors import UsageError
+from jaxpets.envs import half_cheetah
+
+# Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
+_CPU_FLOPS_AN_HOUR = 1e11 * 3600
+
+
+def model_flops(hidden_sizes: Sequence[int]) -> float:
+    """Returns the operations of a particle's step, two per multiply-add.
+
+    Only the network's matrix products are counted.
+    """
+    widths = (
+        half_cheetah.OBS_SIZE + half_cheetah.ACTION_SIZE,  # pitch as sine and cosine,
+        *hidden_sizes,  # but no finite-difference velocity
+        2 * half_cheetah.OBS_SIZE,
+    )
+    return 2.0 * sum(a * b for a, b in itertools.pairwise(widths))
+
+
+def check_cpu(config: Config) -> None:
+    """Refuses what would take over an hour on a CPU by mistake.
+
+    Raises:
+      UsageError: with the hours that it would take.
+    """
+    import jax
+
+    if jax.default_backend() != "cpu" or config.allow_cpu:
+        return
+    _, search = _search(config)
+    rows = search.num_samples * search.num_particles * search.num_iterations
+    steps = _planned_steps(config) * len(config.seeds)
+    flops = model_flops((config.model.hidden_size,) * config.model.num_layers)
+    hours = flops * rows * search.horizon * steps / _CPU_FLOPS_AN_HOUR
+    if hours > 1:
+        raise UsageError(
+            f"--phase {config.phase} of --preset {config.preset} would take about "
+            f"{hours:.0f} hours on this CPU; use a GPU, smaller numbers or --allow-cpu."
+        )
+
+
+def memory_advice(config: Config) -> str:
+    """Returns what is planned at once, and with which flags it would be less."""
+    group, search = _search(config)
+    trials = _num_tasks(config)
+    flags = ["--seeds", f"--{group}.num-samples", f"--{group}.num-particles"]
+    if config.phase == "zero-shot":
+        trials *= config.eval_trials
+        flags.insert(1, "--eval-trials")
+    return (
+        f"out of memory. {len(config.seeds)} seeds x {trials} trials x "
+        f"{search.num_samples} samples x {search.num_particles} particles x horizon "
+        f"{search.horizon} are planned at once; lower one of {', '.join(flags)}. The "
+        "last checkpoint is intact."
+    )
+
+
+def _search(config: Config) -> tuple[str, PlannerConfig]:
+    """Returns the search of a phase, and what its flags are called."""
+    if config.phase == "explore":
+        return "planner", config.planner
+    return "task-planner", config.task_planner
+
+
+def _num_tasks(config: Config) -> int:
+    """Returns how many tasks are planned for at once; exploration is one."""
+    return NUM_TASKS if config.phase != "explore" and config.task == "all" else 1
+
+
+def _planned_steps(config: Config) -> int:
+    """Returns how many steps of environments a seed plans for in a phase."""
+    if config.phase == "explore":
+        planned = config.num_trials - config.random_trials
+        return planned * config.trial_length if config.arm != "random" else 0
+    zero_shot = config.phase == "zero-shot"
+    trials = config.eval_trials if zero_shot else config.finetune_trials
+    return _num_tasks(config) * trials * config.task_length

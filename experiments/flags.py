@@ -1,0 +1,226 @@
+"""The command line as tyro reads it: which flags a phase has, and what was given."""
+
+import contextlib
+import dataclasses
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+
+import msgspec
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
+
+from experiments.config import (
+    Basics,
+    Compute,
+    Config,
+    Origin,
+    Output,
+    Process,
+    Science,
+    Variant,
+    part,
+)
+from experiments.entries import entries, flag, hints, read
+from experiments.errors import UsageError
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Explore(Process, Compute, Science, Output, Basics):
+    """Phase 1: learns a model, without a reward.
+
+    The numbers of phase 2 are kept for the commands that start from this run.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class ZeroShot(Process, Compute, Science, Origin, Variant, Output, Basics):
+    """Phase 2: performs tasks with an explored model and learns nothing.
+
+    The numbers are those of the exploration run unless a flag says otherwise.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class Finetune(ZeroShot):
+    """Phase 2 goes on: learns from the trials of a task, too.
+
+    The numbers are those of the exploration run unless a flag says otherwise.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Makes tables and figures of all logs in a folder."""
+
+    out: Path = Path("runs")
+    """Folder of all runs; the report is in OUT/report."""
+    debug: bool = False
+    """Show tracebacks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Overview(Origin, Variant, Output, Basics):
+    """The flags that are used most."""
+
+
+COMMANDS = {
+    "explore": Explore,
+    "zero-shot": ZeroShot,
+    "finetune": Finetune,
+    "report": Report,
+}
+_PROG = "experiments.run"
+_ABOUT = """Unsupervised exploration with deep model-based RL on HalfCheetah.
+
+{}
+
+The same command continues a run that was stopped.
+
+`explore` may be said as `--phase explore`, anywhere among the flags.
+
+These are the flags used most; `explore --help` has all numbers of a phase."""
+
+
+def of(
+    role: type[T], argv: Sequence[str], default: T, command: str | None = None
+) -> tuple[T, list[str]]:
+    """Returns the flags of a dataclass and what is left of a command line.
+
+    Args:
+      role: its entries are the flags.
+      argv: the command line.
+      default: what flags that are not given are.
+      command: the phase that `--help` explains; None to leave that to others.
+
+    Raises:
+      UsageError: if the value of a flag is not valid.
+      SystemExit: after `--help`.
+    """
+    found, rest = tyro.cli(
+        role,
+        args=list(argv),
+        default=default,
+        return_unknown_args=True,
+        add_help=command is not None,
+        registry=_AS_WRITTEN,
+        prog=f"{_PROG} {command}",
+    )
+    return read(role, _given(found), default, _refuse), rest
+
+
+def explain(default: Config) -> None:
+    """Prints what there is to do and the flags that are used most.
+
+    Raises:
+      SystemExit: when that is done.
+    """
+    docs = {name: str(role.__doc__) for name, role in COMMANDS.items()}
+    phases = [f"- {name}: {doc.splitlines()[0]}" for name, doc in docs.items()]
+    tyro.cli(
+        Overview,
+        args=["--help"],
+        default=part(default, Overview),
+        description=_ABOUT.format("\n".join(phases)),
+        registry=_AS_WRITTEN,
+        prog=f"{_PROG} {{{','.join(COMMANDS)}}}",
+    )
+
+
+def beside(rest: Sequence[str], default: Config, command: str) -> Config:
+    """Returns what is left of a command line, as flags of other phases.
+
+    In a report they do nothing, so that one command line may serve all phases. Others
+    must say what is so anyway.
+
+    Raises:
+      UsageError: for what is no flag, or is not for this phase.
+    """
+    found, rest = of(Config, rest, default)
+    if rest:
+        said = rest[0].partition("=")[0]
+        flags = [flag(entry.name) for entry in entries(COMMANDS[command])]
+        near = difflib.get_close_matches(said.replace("_", "-"), flags, 1)
+        hint = f"Perhaps {near[0]}?" if near else "See --help."
+        raise UsageError(f"{said} is not a flag of {command}. {hint}")
+    for entry in entries(Config):
+        if command != "report" and entry.of(found) != entry.of(default):
+            phases = [name for name, role in COMMANDS.items() if entry in entries(role)]
+            wanted = f"left out in {command}; it is for {' and '.join(phases)}"
+            raise _refuse(entry.name, entry.of(found), wanted)
+    return found
+
+
+_AS_WRITTEN = ConstructorRegistry()
+
+
+@_AS_WRITTEN.primitive_rule
+def _words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Leaves the words behind a flag to `read`, whose errors say what is valid."""
+    if info.type is bool or dataclasses.is_dataclass(info.type):
+        return None
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=_metavar(info.type),
+        instance_from_str=list,
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: (
+            list(map(str, value)) if isinstance(value, tuple) else [str(value)]
+        ),
+    )
+
+
+def _metavar(hint: Any) -> str:
+    """Returns what a help calls a value."""
+    first, *_ = *get_args(hint), None
+    if get_origin(hint) is Literal:
+        return "{" + ",".join(get_args(hint)) + "}"
+    if get_origin(hint) is tuple:
+        return f"[{_metavar(first)} ...]"
+    if first is not None:
+        return _metavar(first)
+    return {int: "INT", float: "FLOAT", Path: "PATH"}.get(hint, "TEXT")
+
+
+def _given(found: Any) -> dict[str, Any]:
+    """Returns the values of the flags that were given, by the names of fields."""
+    given: dict[str, Any] = {}
+    for name, hint in hints(type(found)).items():
+        value = getattr(found, name)
+        if dataclasses.is_dataclass(value):
+            given[name] = _given(value)
+        elif isinstance(value, list):
+            given[name] = _values(hint, value)
+        elif isinstance(value, bool):
+            given[name] = value
+    return given
+
+
+def _values(hint: Any, words: list[str]) -> Any:
+    """Returns what is meant by the words behind a flag; a single one is no list."""
+    hint = hint.__origin__ if get_origin(hint) is Annotated else hint
+    if get_origin(hint) is tuple:
+        return [_value(get_args(hint)[0], word) for word in words]
+    return _value(hint, words[0]) if len(words) == 1 else words
+
+
+def _value(hint: Any, word: str) -> Any:
+    """Returns a word, or the number or None that it stands for where that is valid."""
+    for meant in (int, float, {"None": None}.__getitem__):
+        with contextlib.suppress(ValueError, KeyError, msgspec.ValidationError):
+            return msgspec.convert(meant(word), hint)
+    return word
+
+
+def _refuse(name: str, value: Any, wanted: str | None) -> UsageError:
+    shown = value
+    if isinstance(value, list):
+        shown = " ".join(map(str, value)) or "with no value"
+    return UsageError(f"{flag(name)} {shown} is not valid; it must be {wanted}.")

@@ -1,0 +1,113 @@
+"""What must hold between the numbers of a config."""
+
+import re
+from typing import Any, get_args
+
+from experiments.config import Config, PlannerConfig, TaskName
+from experiments.entries import Mark, entries, flag
+from experiments.errors import UsageError
+from experiments.storage import rundir
+
+
+def require(holds: bool, flag: str, value: Any, valid: str) -> None:
+    """Raises UsageError with the flag, its value and what would be valid."""
+    if not holds:
+        raise UsageError(f"{flag} {value} is not valid; it must be {valid}.")
+
+
+def validate(config: Config) -> None:
+    """Checks what more than one number decides; each alone is valid already.
+
+    Raises:
+      UsageError: naming the flag, the value and what would be valid.
+    """
+    unique = 0 < len(config.seeds) == len(set(config.seeds))
+    require(unique, "--seeds", config.seeds, "one or more different seeds")
+    _check_members(config)
+    for name in ("planner", "task_planner"):
+        _check_planner(flag(name), getattr(config, name), config.model.num_members)
+    for name in ("training", "tuning"):
+        epochs = getattr(config, name).num_epochs
+        require(epochs > 0, f"--{name}.num-epochs", epochs, "1 to 10,000")
+    random, trials = config.random_trials, config.num_trials
+    valid = f"1 to --num-trials ({trials})"
+    require(random <= trials, "--random-trials", random, valid)
+    for length in (config.trial_length, config.task_length):
+        divides = length % config.chunk_length == 0
+        valid = f"a divisor of the length of a trial ({length})"
+        require(divides, "--chunk-length", config.chunk_length, valid)
+    if config.video is not None:
+        good = config.video.suffix == ".mp4"
+        require(good, "--video", config.video, "a .mp4 file")
+
+
+def _check_members(config: Config) -> None:
+    members = config.model.num_members
+    require(
+        members >= 2 or config.arm in ("count", "random", "oracle"),
+        "--model.num-members",
+        members,
+        f"2 or more for --arm {config.arm}; one member never disagrees",
+    )
+    require(
+        members >= 2 or not config.pessimism,
+        "--pessimism",
+        config.pessimism,
+        "0 with one member; it never disagrees",
+    )
+
+
+def _check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:
+    require(
+        planner.num_elites <= planner.num_samples or planner.optimizer == "mppi",
+        f"{flag}.num-elites",
+        planner.num_elites,
+        f"2 to {flag}.num-samples ({planner.num_samples})",
+    )
+    require(
+        planner.num_particles % num_members == 0,
+        f"{flag}.num-particles",
+        planner.num_particles,
+        f"a multiple of --model.num-members ({num_members})",
+    )
+
+
+def check_names(config: Config) -> None:
+    """Refuses what is no name of a folder, or names another folder of phase 2."""
+    for which, name in (("name", config.name), ("tag", config.tag)):
+        if name is not None:
+            try:
+                rundir.check_name(name)
+            except UsageError as error:
+                raise UsageError(f"--{which}: {error}") from None
+    task = config.tag in get_args(TaskName)
+    require(not task, "--tag", config.tag, "something else; it is a task")
+
+
+def check_explored(config: Config, explored: Config) -> None:
+    """Refuses to call a model what it is not."""
+    for entry in entries(Config):
+        if Mark.EXPLORED in entry.marks:
+            given, found = entry.of(config), entry.of(explored)
+            valid = f"{found}, as in the exploration run"
+            require(given == found, flag(entry.name), given, valid)
+
+
+def check_process(config: Config) -> None:
+    """Refuses half a place among several processes."""
+    address = config.coordinator_address
+    count, own = config.num_processes, config.process_id
+    if address in (None, "auto"):
+        alone = "left out, unless --coordinator-address is HOST:PORT"
+        require(count is None, "--num-processes", count, alone)
+        require(own is None, "--process-id", own, alone)
+    else:
+        named = re.fullmatch(r"\S+:[0-9]{1,5}", str(address)) is not None
+        require(named, "--coordinator-address", address, "HOST:PORT or auto")
+        given = "1 or more, with --coordinator-address"
+        require(count is not None, "--num-processes", count, given)
+        below = count is not None and own is not None and own < count
+        valid = f"0 to one less than --num-processes ({count})"
+        require(below, "--process-id", own, valid)
+    one = config.phase != "report" or address is None
+    require(one, "--coordinator-address", address, "left out in report")
