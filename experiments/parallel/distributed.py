@@ -8,20 +8,19 @@ import atexit
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
 from experiments import errors
 from experiments.errors import OutOfMemoryError, RunError, UsageError
-from experiments.storage.pytrees import describe, from_host, to_host
 
 
-class Place(NamedTuple):
+class ProcessSpec(NamedTuple):
     """This process among the others; None is for jax to find out."""
 
     coordinator_address: str | None
@@ -29,24 +28,33 @@ class Place(NamedTuple):
     process_id: int | None
 
 
+Place = ProcessSpec
+
+
+def say(text: str) -> None:
+    """Prints a line for the user, once for all processes."""
+    if is_first():
+        print(text, file=sys.stderr, flush=True)
+
+
 @contextlib.contextmanager
-def joined(place: Place | None, say: Callable[[str], None]) -> Iterator[None]:
+def joined(spec: ProcessSpec | None) -> Iterator[None]:
     """Makes this process one of several for a while; None leaves it alone.
 
     Raises:
       UsageError: if jax cannot tell where the others are. If they are not there within
         five minutes, it ends the process.
     """
-    if place is None:
+    if spec is None:
         yield
         return
     say("waiting for the other processes, at most 5 minutes.")
     # It would catch SIGTERM, which is a run's own to handle.
     jax.config.update("jax_enable_preemption_service", False)
     # A cluster is asked for the place only: it would also give us one device of many.
-    detect = "deactivate" if place.coordinator_address else None
+    detect = "deactivate" if spec.coordinator_address else None
     try:
-        jax.distributed.initialize(*place, cluster_detection_method=detect)
+        jax.distributed.initialize(*spec, cluster_detection_method=detect)
     except (RuntimeError, ValueError) as error:
         why = str(error).partition("\n")[0].rstrip(".")
         raise UsageError(
@@ -71,14 +79,22 @@ def _leave() -> None:
     jax.distributed.shutdown()
 
 
+def is_alone() -> bool:
+    """Returns whether there is no other process.
+
+    Asked in a way that starts no backend: usage errors come before that.
+    """
+    return not jax.distributed.is_initialized()
+
+
 def is_first() -> bool:
     """Returns whether this process has the run's folder and the screen."""
-    return _alone() or jax.process_index() == 0
+    return is_alone() or jax.process_index() == 0
 
 
 def on_first(call: Callable[[], Any]) -> Any:
     """Calls on process 0 only; all processes get the JSON value or the RunError."""
-    if _alone():
+    if is_alone():
         return call()
     answer, failure = {}, None
     if is_first():
@@ -108,26 +124,17 @@ def held_by_first(manager: contextlib.AbstractContextManager[None]) -> Iterator[
         yield
 
 
-def share(state: Any, template: Any) -> Any:
-    """Gives every process the state of process 0.
+def share(tree: Any) -> Any:
+    """Gives every process the NumPy arrays of process 0.
 
     Args:
-      state: read on process 0 only.
-      template: the state's pytree, arrays or `jax.ShapeDtypeStruct`s.
+      tree: of the same types everywhere; elsewhere its values do not count.
     """
-    if _alone():
-        return state
-    arrays = {
-        name: np.zeros(leaf.shape, jnp.dtype(leaf.dtype))
-        for name, leaf in describe(template).items()
-    }
-    if is_first():
-        saved = to_host(state)
-        arrays = {name: saved[name] for name in arrays}  # its order may be another
-    data = _from_first(_packed(arrays.values()))
-    values = _unpacked(data[None], arrays.values())
-    here = {name: x[0] for name, x in zip(arrays, values, strict=True)}
-    return from_host(here, template)
+    if is_alone():
+        return tree
+    leaves, structure = jax.tree.flatten(tree)
+    data = _from_first(_packed(leaves))
+    return structure.unflatten(x[0] for x in _unpacked(data[None], leaves))
 
 
 def gather(tree: Any) -> Any:
@@ -139,14 +146,9 @@ def gather(tree: Any) -> Any:
 
 def agree(number: int) -> int:
     """Returns the largest number that any process has brought."""
-    if _alone():
+    if is_alone():
         return number
     return int(multihost_utils.process_allgather(np.array(number, np.int32)).max())
-
-
-def _alone() -> bool:
-    """Asks in a way that starts no backend: usage errors come before that."""
-    return not jax.distributed.is_initialized()
 
 
 def _from_first(array: np.ndarray) -> np.ndarray:

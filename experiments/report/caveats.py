@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.report.logs import Row, Scores, number, read_json
+from experiments.report.logs import Row, Scores, number
 from experiments.report.tables import ARMS, TASKS, flat, in_order
+from experiments.storage import rundir
 
 # Entries of a config that say what to run and where, not how.
 _NOT_SETTINGS = {
@@ -141,7 +142,7 @@ def _unequal(runs: dict[Path, str]) -> Iterator[str]:
         for run in sorted(run for run in runs if runs[run] == phase):
             label = run.parent.name if phase != "explore" else run.name
             labels.add(label)
-            for name, value in flat(read_json(run / "config.json")).items():
+            for name, value in flat(rundir.find_json(run / rundir.CONFIG)).items():
                 if name.split(".")[0] not in skipped:
                     by_value = values.setdefault(name, {})
                     by_value.setdefault(str(value), set()).add(label)

@@ -17,7 +17,7 @@ import pytest
 import runs
 
 from experiments import cli
-from experiments.parallel.distributed import Place
+from experiments.parallel.distributed import ProcessSpec
 from experiments.report import coverage
 from experiments.run import main
 from experiments.storage import checkpoint
@@ -252,10 +252,10 @@ def test_auto_needs_a_cluster(monkeypatch):
     ("flags", "wanted"),
     [
         ((), None),
-        (("--coordinator-address", "auto"), Place(None, None, None)),
+        (("--coordinator-address", "auto"), ProcessSpec(None, None, None)),
         (
             ("--coordinator-address=h:1", "--num_processes", "3", "--process-id", "2"),
-            Place("h:1", 3, 2),
+            ProcessSpec("h:1", 3, 2),
         ),
     ],
     ids=["alone", "auto", "named"],
