@@ -39,7 +39,7 @@ class Row(NamedTuple):
     task: str  # empty while exploring
     trial: int
     explored: int  # exploration trials behind the model; 0 while exploring
-    tag: str  # of another variant of phase 2; empty for the one that counts
+    tag: str  # of a variant of phase 2; empty for the one that Table 1 counts
     data: dict[str, Any]
     run: Path  # folder of the log
 
