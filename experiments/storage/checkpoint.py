@@ -74,13 +74,17 @@ def save(
     arrays, leaves = pytrees.to_host(state), pytrees.describe(state)
     record = {"schema": SCHEMA, "jaxpets": jaxpets.__version__, "step": step}
     record = json.dumps(record | {"leaves": leaves, "meta": meta}, allow_nan=False)
+    size = 200_000 + sum(x.nbytes for x in arrays.values())  # orbax compresses them
     kept = [policies.LatestN(keep), policies.CustomSteps(list(milestones))]
     try:
         directory.mkdir(parents=True, exist_ok=True)
         step_folders.sweep(directory)
+        if disk.free_bytes(directory) < size:
+            # Orbax would find out too, after pages of its threads' tracebacks.
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         _write(directory, step, arrays, json.loads(record), kept)
     except Exception as error:
-        if what := _what_failed(error, directory, f"checkpoint {step}", arrays):
+        if what := _what_failed(error, directory, f"checkpoint {step}", size):
             good = "No earlier one" if good == "none" else f"Checkpoint {good}"
             advice = "free space or check the disk, and run the same command."
             raise StorageError(f"{what}. {good} is intact; {advice}") from error
@@ -110,13 +114,8 @@ def restore(
       CheckpointError: if nothing there can be used; the message says why.
     """
     directory = Path(directory).resolve()
-    numbers, damaged = names(directory), {}
-    if step is not None and step not in numbers:
-        there = (
-            f"no checkpoint {step} in {directory} (there: {_listed(steps(directory))})"
-        )
-        raise CheckpointError(f"{there}. Choose another.")
-    for number in numbers[::-1] if step is None else [step]:
+    damaged: dict[int, str] = {}
+    for number in [n for n in names(directory)[::-1] if step in (None, n)]:
         try:
             state, meta = _read(directory, number, template, part)
         except _DamagedError as error:
@@ -128,7 +127,8 @@ def restore(
         return number, state, meta
     if step is not None:
         others = _listed([number for number in steps(directory) if number != step])
-        what = f"checkpoint {step} in {directory} is damaged ({damaged[step]})"
+        what = f"checkpoint {step} in {directory}"
+        what = f"{what} is damaged ({damaged[step]})" if damaged else f"no {what}"
         raise CheckpointError(f"{what}. Choose another (there: {others}).")
     if damaged:
         reasons = "; ".join(f"{number}: {why}" for number, why in damaged.items())
@@ -147,9 +147,6 @@ def _write(
     directory: Path, step: int, arrays: dict[str, np.ndarray], record: Any, kept: Any
 ) -> None:
     """Lets orbax write a step, then drop those that no policy of `kept` keeps."""
-    if disk.free_bytes(directory) < _size(arrays):
-        # Orbax would find out too, after pages of its threads' tracebacks.
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     # Orbax refuses arrays of size zero; the record has their shape.
     stored = {name: array for name, array in arrays.items() if array.size}
     items = {"state": ocp.args.StandardSave(stored), "meta": ocp.args.JsonSave(record)}
@@ -188,14 +185,7 @@ def _draft_of(stored: dict[str, np.ndarray]) -> type:
     return Draft
 
 
-def _size(arrays: Mapping[str, np.ndarray]) -> int:
-    """Returns an upper bound of the bytes of a step: orbax compresses the arrays."""
-    return 200_000 + sum(array.nbytes for array in arrays.values())
-
-
-def _what_failed(
-    error: Exception, directory: Path, step: str, arrays: Mapping[str, np.ndarray]
-) -> str | None:
+def _what_failed(error: Exception, directory: Path, step: str, size: int) -> str | None:
     """Says what the disk did to a save; None if it is a bug of ours."""
     if isinstance(error, _DamagedError):
         return f"{step} in {directory} did not read back ({error})"
@@ -203,25 +193,24 @@ def _what_failed(
         return None
     full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     reason = "no space for" if full else f"{os.strerror(number)} writing"
-    needs, free = map(disk.megabytes, (_size(arrays), disk.free_bytes(directory)))
+    needs, free = map(disk.megabytes, (size, disk.free_bytes(directory)))
     return f"{reason} {step} in {directory} (needs {needs}, {free} free)"
 
 
 def _read(directory: Path, number: int, template: Any, part: bool) -> tuple[Any, Any]:
     """Returns state and meta of one step; raises CheckpointError if it does not fit."""
-    meta, state = ocp.args.JsonRestore(), ocp.args.StandardRestore()
+    meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
+    state = ocp.args.Composite(state=ocp.args.StandardRestore())
     try:
         if why := broken(directory / str(number)):
             raise _DamagedError(why)
         with _manager(directory, read_only=True) as manager:
-            record = manager.restore(number, args=ocp.args.Composite(meta=meta))["meta"]
+            record = manager.restore(number, args=meta)["meta"]
             if record["step"] != number:
                 raise _DamagedError(f"it is step {record['step']}")
             if why := _misfit(record, template, part):
                 raise CheckpointError(f"checkpoint {number} in {directory} {why}")
-            arrays = manager.restore(number, args=ocp.args.Composite(state=state))[
-                "state"
-            ]
+            arrays = manager.restore(number, args=state)["state"]
     except PermissionError as error:
         what = f"cannot read checkpoint {number} in {directory} ({error.strerror})"
         raise StorageError(f"{what}. Check its permissions.") from error

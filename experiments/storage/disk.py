@@ -1,13 +1,9 @@
 """Files that survive a power cut, and disk errors as one line for the user."""
 
-import contextlib
 import os
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
-
-from experiments.errors import StorageError
 
 
 def sync(path: Path) -> None:
@@ -47,16 +43,3 @@ def free_bytes(path: Path) -> int:
 def megabytes(size: int) -> str:
     """Formats a size for a message."""
     return f"{size / 1e6:.3g} MB" if size < 1e9 else f"{size / 1e9:.3g} GB"
-
-
-@contextlib.contextmanager
-def storage_errors(doing: str) -> Iterator[None]:
-    """Turns an OSError into a StorageError: `cannot <doing> (<reason>). ...`."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise StorageError(
-            f"cannot {doing} ({reason}). Free the disk, check its permissions, or "
-            "choose another run directory."
-        ) from error

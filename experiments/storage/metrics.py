@@ -21,9 +21,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.errors import CheckpointError, UsageError
+from experiments.errors import CheckpointError, UsageError, storage_errors
 from experiments.storage import rundir
-from experiments.storage.disk import storage_errors
 
 # Names in rows of older versions.
 _RENAMED = {"loss": "nll"}

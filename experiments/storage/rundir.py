@@ -16,8 +16,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.errors import CheckpointError, StorageError, UsageError
-from experiments.storage.disk import free_bytes, megabytes, storage_errors, sync
+from experiments.errors import (
+    CheckpointError,
+    StorageError,
+    UsageError,
+    storage_errors,
+)
+from experiments.storage.disk import free_bytes, megabytes, sync
 
 CONFIG = "config.json"
 ENVIRONMENT = "env.json"

@@ -16,6 +16,7 @@ import itertools
 import os
 import shutil
 import stat
+import time
 from pathlib import Path
 
 SEAL = "SHA256SUMS"
@@ -42,10 +43,9 @@ def steps(directory: Path) -> list[int]:
 
 def quarantine(directory: Path, number: int) -> str:
     """Sets a damaged step aside and returns what became of it, for the warning."""
-    first = directory / f".corrupt-{number}"
-    more = (first.with_name(f"{first.name}.{i}") for i in itertools.count(2))
-    tries = itertools.chain([first], more)
-    target = next(path for path in tries if not os.path.lexists(path))
+    target = directory / f".corrupt-{number}"
+    if os.path.lexists(target):
+        target = target.with_name(f"{target.name}.{time.time_ns()}")
     try:
         (directory / str(number)).rename(target)
     except OSError as error:  # Another user's run, say: it can be read, not changed.
