@@ -100,8 +100,8 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
         return cli.differences(old, plain, cli.CONTINUED, default)
 
     branches = len(config.seeds)
-    if config.phase == "finetune":
-        branches *= _num_tasks(config)
+    if (config.phase, config.task) == ("finetune", "all"):
+        branches *= NUM_TASKS
     size = _NEEDED_BYTES * branches
     with (
         _without_gl(),

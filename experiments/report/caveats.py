@@ -129,7 +129,7 @@ def _not_finite(rows: Sequence[Row]) -> Iterator[str]:
 
 def _torn(runs: Iterable[Path]) -> Iterator[str]:
     for run in sorted(runs):
-        if not (run / "metrics.jsonl").read_bytes().endswith(b"\n"):
+        if not (run / rundir.METRICS).read_bytes().endswith(b"\n"):
             yield f"The last line of {run.name}/metrics.jsonl is cut off; left out."
 
 

@@ -51,7 +51,7 @@ def row(
     found = {**label, "value": value, "turns": turns, "returns": returns}
     if label.get("task"):
         found["return"] = returns[label["task"]]
-    return found if fit is None else found | {"fit": _renamed(fit)}
+    return found if fit is None else found | {"fit": fit}
 
 
 def arm_label(arm: str, config: Mapping[str, Any]) -> str:
@@ -87,7 +87,8 @@ def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
 def _parsed(data: dict[str, Any], config: Mapping[str, Any], run: Path) -> Row:
     exploring = data["phase"] == "explore"
     if fit := data.get("fit"):
-        data = data | {"fit": _renamed(fit)}
+        fit = {_RENAMED.get(name, name): value for name, value in fit.items()}
+        data = data | {"fit": fit}
     return Row(
         preset=config["preset"],
         arm=arm_label(data["arm"], config),
@@ -100,10 +101,6 @@ def _parsed(data: dict[str, Any], config: Mapping[str, Any], run: Path) -> Row:
         data=data,
         run=run,
     )
-
-
-def _renamed(fit: Mapping[str, Any]) -> dict[str, Any]:
-    return {_RENAMED.get(name, name): value for name, value in fit.items()}
 
 
 def append_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
