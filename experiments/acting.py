@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from experiments.parallel import devices
-from experiments.parallel.devices import AXES, SEED, TASK, Spread
+from experiments.parallel.devices import AXES, SEED, TASK, Placement
 from jaxpets.envs import half_cheetah
 
 # Called between chunks with the environment steps done; may raise to stop the run.
@@ -40,20 +40,20 @@ class Trials(NamedTuple):
 
 def explorers(
     env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int,
-    spread: Spread,
+    placement: Placement,
 ) -> Actors:  # fmt: skip
     """Returns actors over seeds `[S]`; params and reward data are per seed."""
     start, chunk = _one(env, planner, horizon, length)
     params = jaxpets.PlanParams(P(SEED), P(SEED))
-    return _spread(spread, jax.vmap(start), jax.vmap(chunk), params, SEED)
+    return _actors(placement, jax.vmap(start), jax.vmap(chunk), params, SEED)
 
 
-def performers(
+def evaluators(
     env: jaxpets.Env,
     planner: jaxpets.Planner,
     horizon: int,
     length: int,
-    spread: Spread,
+    placement: Placement,
     *,
     shared_model: bool,
 ) -> Actors:
@@ -70,7 +70,7 @@ def performers(
     starts = jax.vmap(jax.vmap(jax.vmap(start)))
     models = P(SEED) if shared_model else P(SEED, TASK)
     params = jaxpets.PlanParams(models, P(TASK))
-    return _spread(spread, starts, over_seeds, params, *AXES)
+    return _actors(placement, starts, over_seeds, params, *AXES)
 
 
 def run(
@@ -120,18 +120,18 @@ def score(transitions: jaxpets.Transition) -> tuple[Array, Array]:
     return jnp.sum(rewards, axis=-2), turns
 
 
-def _spread(
-    spread: Spread, starts: Callable[..., Any], chunks: Callable[..., Any],
+def _actors(
+    placement: Placement, starts: Callable[..., Any], chunks: Callable[..., Any],
     params: jaxpets.PlanParams, *axes: str,
 ) -> Actors:  # fmt: skip
     """Returns actors over `axes`; params holds the axes of what they read."""
     every = P(*axes)
-    start = devices.split(spread, starts, every, every)
-    chunk = devices.split(spread, chunks, (params, every, every), every)
+    start = devices.split(placement, starts, every, every)
+    chunk = devices.split(placement, chunks, (params, every, every), every)
     return Actors(
         jax.jit(start),
         jax.jit(chunk),
-        lambda keys: devices.place(spread, keys, *axes),
+        lambda keys: devices.place(placement, keys, *axes),
     )
 
 

@@ -1,5 +1,8 @@
 """What can end a run, each with the exit code the README promises."""
 
+import contextlib
+from collections.abc import Iterator
+
 
 class RunError(Exception):
     """A failure that is not a bug; its message is one line for the user."""
@@ -41,3 +44,16 @@ class InterruptedRun(RunError):
     """A signal; the same command goes on from the last checkpoint."""
 
     exit_code = 75
+
+
+@contextlib.contextmanager
+def storage_errors(doing: str) -> Iterator[None]:
+    """Turns an OSError into a StorageError: `cannot <doing> (<reason>). ...`."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StorageError(
+            f"cannot {doing} ({reason}). Free the disk, check its permissions, or "
+            "choose another run directory."
+        ) from error

@@ -4,10 +4,10 @@ Each is a loop over trials around a few jitted functions. Seeds, tasks and repea
 trials are the leading axes of every array.
 """
 
+import dataclasses
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -15,44 +15,55 @@ from jax import Array
 
 import jaxpets
 from experiments import acting, loop, records
-from experiments.acting import Tick, Trials
+from experiments.acting import Actors, Tick, Trials
 from experiments.build import (
     EXPLORE,
     FINETUNE,
     ZERO_SHOT,
+    Learn,
     Parts,
     State,
     build,
     trial_keys,
 )
 from experiments.config import Config
-from experiments.loop import Loop, Say
-from experiments.parallel import devices, distributed
-from experiments.parallel.devices import SEED, TASK, Spread
+from experiments.parallel import devices
+from experiments.parallel.devices import SEED, TASK, Placement
 from experiments.progress import Progress
 from experiments.refit import refit
 from experiments.report import coverage
-from experiments.storage import checkpoint, rundir
+from experiments.storage.folder import RunFolder
 from jaxpets.envs import half_cheetah
 
 
-def explore(config: Config, folder: Path, say: Say) -> None:
-    """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
-    parts = build(config)
-    spread = _spread(say, len(config.seeds))
-    random = acting.explorers(parts.env, parts.random, 1, config.chunk_length, spread)
-    planned = acting.explorers(
-        parts.env, parts.explorer, config.planner.horizon, config.chunk_length, spread
-    )
+@dataclasses.dataclass(frozen=True)
+class _Exploration:
+    """Trials of one branch per seed."""
 
-    def act(trial: int, state: State, keys: Array, tick: Tick) -> Trials:
-        actors = random if trial <= config.random_trials else planned
+    config: Config
+    placement: Placement
+    random: Actors  # at first
+    planned: Actors
+    learn: Learn
+
+    name: ClassVar[str] = "explore"
+    axes: ClassVar[tuple[str, ...]] = (SEED,)
+
+    @property
+    def trial_length(self) -> int:
+        return self.config.trial_length
+
+    def keys(self, trial: int) -> Array:
+        return trial_keys(self.config, EXPLORE, trial)
+
+    def act(self, trial: int, state: State, keys: Array, tick: Tick) -> Trials:
+        actors = self.random if trial <= self.config.random_trials else self.planned
         params = jaxpets.PlanParams(state.params, state.reward)
-        return acting.run(
-            actors, params, keys, config.trial_length // config.chunk_length, tick
-        )
+        num_chunks = self.trial_length // self.config.chunk_length
+        return acting.run(actors, params, keys, num_chunks, tick)
 
-    def labels(trial: int) -> list[dict[str, Any]]:
+    def labels(self, trial: int) -> list[dict[str, Any]]:
+        config = self.config
         random = trial <= config.random_trials or config.arm == "random"
         planner = "random" if random else "plan"
         common = {"phase": "explore", "arm": config.arm, "planner": planner}
@@ -62,48 +73,97 @@ def explore(config: Config, folder: Path, say: Say) -> None:
             for seed in config.seeds
         ]
 
-    learn = loop.learner(spread, parts.learner.learn, SEED)
-    keys = lambda trial: trial_keys(config, EXPLORE, trial)  # noqa: E731
-    init = jax.jit(jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES))(keys(0))
-    own = Loop(
-        "explore", config.trial_length, spread, (SEED,), keys, act, learn, labels
+
+@dataclasses.dataclass(frozen=True)
+class _Finetuning:
+    """Trials of one branch per seed and task."""
+
+    config: Config
+    placement: Placement
+    actors: Actors
+    learn: Learn
+    tasks: Sequence[str]
+    weights: half_cheetah.TaskWeights  # [K]
+    explored: int  # trials behind the model
+
+    name: ClassVar[str] = "finetune"
+    axes: ClassVar[tuple[str, ...]] = (SEED, TASK)
+
+    @property
+    def trial_length(self) -> int:
+        return self.config.task_length
+
+    def keys(self, trial: int) -> Array:
+        return _key_per(_task_ids(self.tasks), trial_keys(self.config, FINETUNE, trial))
+
+    def act(self, trial: int, state: State, keys: Array, tick: Tick) -> Trials:
+        del trial
+        params = jaxpets.PlanParams(state.params, self.weights)
+        num_chunks = self.trial_length // self.config.chunk_length
+        trials = acting.run(self.actors, params, keys[..., None], num_chunks, tick)
+        return jax.tree.map(lambda x: x.squeeze(2), trials)
+
+    def labels(self, trial: int) -> list[dict[str, Any]]:
+        arm, explored = self.config.arm, self.explored
+        common = {"phase": "finetune", "arm": arm, "explored_trials": explored}
+        return [
+            {**common, "seed": seed, "task": task, "trial": trial}
+            for seed in self.config.seeds
+            for task in self.tasks
+        ]
+
+
+def explore(config: Config, run: RunFolder) -> None:
+    """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
+    parts = build(config)
+    placement = _placement(run, len(config.seeds))
+    length, horizon = config.chunk_length, config.planner.horizon
+    phase = _Exploration(
+        config=config,
+        placement=placement,
+        random=acting.explorers(parts.env, parts.random, 1, length, placement),
+        planned=acting.explorers(parts.env, parts.explorer, horizon, length, placement),
+        learn=loop.over_branches(placement, parts.learner.learn, SEED),
     )
-    trials = loop.run(config, folder, own, init, 0, config.num_trials, say)
+    init = jax.jit(jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES))(
+        phase.keys(0)
+    )
+    last = config.num_trials
+    trials = loop.run(run, phase, init, 0, last)
     data = data_of(explored_template(config, parts))
-    last, anew = config.num_trials, trials is not None
-    distributed.on_first(
-        lambda: coverage.write(folder, config.seeds, data, last, anew=anew, warn=say)
-    )
+    coverage.write(run, config.seeds, data, last, anew=trials is not None)
 
 
-def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -> None:
-    """Phase 2, first attempt: tasks planned with the explored model, nothing learned.
+def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
+    """Phase 2, at first: tasks planned with the explored model, nothing learned.
 
-    The jump-start of Table 1. The model that performs is saved beside its log.
+    The jump-start of Table 1. The model that acts is saved beside its log.
     """
-    log = folder / "metrics.jsonl"
-    if distributed.on_first(lambda: rundir.log_size(log)):  # written once, at the end
-        say(f"already complete: {config.eval_trials} of {config.eval_trials} trials.")
+    if run.has_log():  # written once, at the end
+        run.say(
+            f"already complete: {config.eval_trials} of {config.eval_trials} trials."
+        )
         return
     parts = build(config)
-    model = _performing(config, source, folder, step, parts, say)
+    model = _model(config, source, run, step, parts)
     names, weights = _tasks(config)
-    spread = _spread(say, len(config.seeds), len(names), config.eval_trials)
-    actors = acting.performers(
+    placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
+    actors = acting.evaluators(
         parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
-        spread, shared_model=True,
+        placement, shared_model=True,
     )  # fmt: skip
-    keys = _fan(trial_keys(config, ZERO_SHOT, step), _task_ids(names))
-    keys = _fan(keys, range(config.eval_trials))
+    keys = _key_per(_task_ids(names), trial_keys(config, ZERO_SHOT, step))
+    keys = _key_per(range(config.eval_trials), keys)
     params = jaxpets.PlanParams(
-        devices.place(spread, model.params, SEED), devices.place(spread, weights, TASK)
+        devices.place(placement, model.params, SEED),
+        devices.place(placement, weights, TASK),
     )
     num_chunks = config.task_length // config.chunk_length
     progress = Progress(config.task_length, 0, "zero-shot")
     begin = time.monotonic()
     with progress.interruptible():
         trials = acting.run(actors, params, keys, num_chunks, progress.tick)
-    trials = devices.collect(spread, trials, *devices.AXES)
+    trials = devices.collect(placement, trials, *devices.AXES)
     records.check_finite(trials, step)
     common = {"phase": "zero-shot", "arm": config.arm, "explored_trials": step}
     labels = [
@@ -113,104 +173,41 @@ def zero_shot(config: Config, source: Path, folder: Path, step: int, say: Say) -
         for trial in range(config.eval_trials)
     ]
     rows = records.rows(labels, trials)
-    paths = folder / "trajectories.npz"
-    distributed.on_first(lambda: records.save_paths(paths, trials, config.seeds, names))
-    distributed.on_first(lambda: rundir.append_rows(log, rows))
-    say(_summary(rows, names, f"{time.monotonic() - begin:.0f} s"))
+    run.save_trajectories(**records.trajectories(trials, config.seeds, names))
+    run.log(rows)
+    run.say(records.summary(rows, names, time.monotonic() - begin))
 
 
-def finetune(config: Config, source: Path, folder: Path, step: int, say: Say) -> None:
+def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
     """Phase 2, goes on: the loop of PETS with a task's reward, one branch per task.
 
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
     """
     parts = build(config)
     names, weights = _tasks(config)
-    spread = _spread(say, len(config.seeds), len(names))
-    weights = devices.place(spread, weights, TASK)
-    actors = acting.performers(
-        parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
-        spread, shared_model=False,
+    placement = _placement(run, len(config.seeds), len(names))
+    phase = _Finetuning(
+        config=config,
+        placement=placement,
+        actors=acting.evaluators(
+            parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
+            placement, shared_model=False,
+        ),
+        learn=loop.over_branches(placement, parts.finetuner.learn, SEED, TASK),
+        tasks=names,
+        weights=devices.place(placement, weights, TASK),
+        explored=step,
     )  # fmt: skip
-
-    def act(trial: int, state: State, keys: Array, tick: Tick) -> Trials:
-        del trial
-        params = jaxpets.PlanParams(state.params, weights)
-        keys = keys[..., None]
-        num_chunks = config.task_length // config.chunk_length
-        trials = acting.run(actors, params, keys, num_chunks, tick)
-        return jax.tree.map(lambda x: x.squeeze(2), trials)
-
-    def labels(trial: int) -> list[dict[str, Any]]:
-        common = {"phase": "finetune", "arm": config.arm, "explored_trials": step}
-        return [
-            {**common, "seed": seed, "task": task, "trial": trial}
-            for seed in config.seeds
-            for task in names
-        ]
-
-    learn = loop.learner(spread, parts.finetuner.learn, SEED, TASK)
-    keys = lambda trial: _fan(trial_keys(config, FINETUNE, trial), _task_ids(names))  # noqa: E731
-    explored = _explored(config, source, step, parts, say)
-    begun = distributed.on_first(lambda: bool(checkpoint.steps(folder / "checkpoints")))
-    if parts.refitter and not begun:
-        explored = refit(config, parts.refitter, explored, step, say)
+    explored = source.restore_trial(step, explored_template(config, parts))
+    if parts.refitter and not run.steps():
+        explored = refit(config, parts.refitter, explored, step, run)
     capacity = explored.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
     init = _branch(explored, len(names), capacity)
-    axes = (SEED, TASK)
-    own = Loop("finetune", config.task_length, spread, axes, keys, act, learn, labels)
-    last = step + config.finetune_trials
-    trials = loop.run(config, folder, own, init, step, last, say)
+    trials = loop.run(run, phase, init, step, step + config.finetune_trials)
     if trials is not None:
         trials = jax.tree.map(lambda x: x[:, :, None], trials)
-        paths = folder / "trajectories.npz"
-        distributed.on_first(
-            lambda: records.save_paths(paths, trials, config.seeds, names)
-        )
-
-
-def _performing(
-    config: Config, source: Path, folder: Path, step: int, parts: Parts, say: Say
-) -> State:
-    """Returns the model `[S]` to perform with, from a run that was stopped or anew."""
-    checkpoints = folder / "checkpoints"
-    template = model_of(explored_template(config, parts))
-    if found := loop.restore(checkpoints, template, say):
-        return found[1]
-    fitter = parts.refitter
-    state = _explored(config, source, step, parts, say, only_model=fitter is None)
-    if fitter:
-        state = refit(config, fitter, state, step, say)
-    model = model_of(state)
-    distributed.on_first(
-        lambda: checkpoint.save(checkpoints, step, model, {}, finite=model)
-    )
-    return model
-
-
-def _spread(say: Say, *counts: int) -> Spread:
-    """Spreads branches over hosts and devices, and says what stays idle."""
-    spread = devices.spread(*counts)
-    if line := devices.idle(spread):
-        say(line)
-    return spread
-
-
-def _explored(
-    config: Config, source: Path, step: int, parts: Parts, say: Say, *,
-    only_model: bool = False,
-) -> State:  # fmt: skip
-    """Restores the learner `[S]` of an exploration run after trial `step`.
-
-    With `only_model` all but the model may be missing there, and is here.
-    """
-    template = explored_template(config, parts)
-    if only_model:
-        template = model_of(template)
-    found = loop.restore(source / "checkpoints", template, say, step, part=only_model)
-    assert found is not None
-    return found[1]
+        run.save_trajectories(**records.trajectories(trials, config.seeds, names))
 
 
 def explored_template(config: Config, parts: Parts) -> State:
@@ -227,6 +224,30 @@ def model_of(state: State) -> State:
 def data_of(state: State) -> State:
     """Returns the dataset of a learner, with nothing in the other places."""
     return jax.tree.map(lambda _: None, state)._replace(dataset=state.dataset)
+
+
+def _model(
+    config: Config, source: RunFolder, run: RunFolder, step: int, parts: Parts
+) -> State:
+    """Returns the model `[S]` to plan tasks with, from a stopped run or made anew."""
+    whole = explored_template(config, parts)
+    if found := run.restore(model_of(whole)):
+        return found[1]
+    if parts.refitter:
+        state = source.restore_trial(step, whole)
+        model = model_of(refit(config, parts.refitter, state, step, run))
+    else:  # all but the model may be missing there
+        model = source.restore_trial(step, model_of(whole), part=True)
+    run.save(step, model)
+    return model
+
+
+def _placement(run: RunFolder, *counts: int) -> Placement:
+    """Spreads branches over hosts and devices, and says what stays idle."""
+    placement = devices.spread(*counts)
+    if line := devices.idle(placement):
+        run.say(line)
+    return placement
 
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:
@@ -254,19 +275,10 @@ def _task_ids(names: Sequence[str]) -> list[int]:
     return [half_cheetah.TASK_NAMES.index(name) for name in names]
 
 
-def _fan(keys: Array, ids: Sequence[int]) -> Array:
+def _key_per(ids: Sequence[int], keys: Array) -> Array:
     """Derives keys `[..., K]` from keys `[...]`; a task has the same key in any set."""
     data = jnp.asarray(list(ids), jnp.uint32)
-    fan = jax.vmap(jax.random.fold_in, (None, 0))
+    fold = jax.vmap(jax.random.fold_in, (None, 0))
     for _ in keys.shape:
-        fan = jax.vmap(fan, (0, None))
-    return fan(keys, data)
-
-
-def _summary(rows: list[dict[str, Any]], names: Sequence[str], time: str) -> str:
-    lines = [f"zero-shot returns ({time}):"]
-    for name in names:
-        own = [row["return"] for row in rows if row["task"] == name]
-        each = " ".join(f"{value:.0f}" for value in own)
-        lines.append(f"  {name:<11}{sum(own) / len(own):8.0f}   trials: {each}")
-    return "\n".join(lines)
+        fold = jax.vmap(fold, (0, None))
+    return fold(keys, data)

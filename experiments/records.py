@@ -1,7 +1,6 @@
-"""From arrays of trials to the rows of metrics.jsonl and to trajectories.npz."""
+"""From arrays of trials to rows of the log, and to what a video is made of."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 import jaxpets
 from experiments.acting import Trials, score
 from experiments.errors import DivergedError
+from experiments.storage import metrics
 from jaxpets.envs import half_cheetah
 
 
@@ -41,20 +41,16 @@ def rows(
     flat_returns = np.asarray(returns).reshape(-1, len(half_cheetah.TASK_NAMES))
     table = []
     for i, label in enumerate(labels):
-        named = dict(
+        named: dict[str, float] = dict(
             zip(half_cheetah.TASK_NAMES, flat_returns[i].tolist(), strict=True)
         )
-        row = {**label, "value": value.flat[i].item()}
-        row |= {"turns": np.asarray(turns).flat[i].item(), "returns": named}
-        if label.get("task"):
-            row["return"] = named[label["task"]]
-        if fit is not None and params is not None:
-            row["fit"] = _fit_row(fit, params, i)
-        table.append(row)
+        own = None if fit is None or params is None else _fit(fit, params, i)
+        net = np.asarray(turns).flat[i].item()
+        table.append(metrics.row(label, value.flat[i].item(), net, named, own))
     return table
 
 
-def _fit_row(
+def _fit(
     fit: jaxpets.FitMetrics, params: jaxpets.EnsembleParams, i: int
 ) -> dict[str, float]:
     row = {name: np.asarray(x).flat[i].item() for name, x in fit._asdict().items()}
@@ -65,21 +61,20 @@ def _fit_row(
     return row
 
 
-def save_paths(
-    path: Path, trials: Trials, seeds: Sequence[int], tasks: Sequence[str]
-) -> None:
-    """Writes the observations of trials `[S, K, R, T, *]` for videos."""
+def trajectories(
+    trials: Trials, seeds: Sequence[int], tasks: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Returns the observations of trials `[S, K, R, T, *]` and what they belong to."""
     returns, _ = score(trials.transitions)
     columns = [half_cheetah.TASK_NAMES.index(task) for task in tasks]
-    own = np.stack([np.asarray(returns)[:, k, :, c] for k, c in enumerate(columns)], 1)
-    np.savez_compressed(
-        path,
-        obs=np.asarray(trials.transitions.next_obs),
-        action=np.asarray(trials.transitions.action),
-        seeds=np.asarray(seeds),
-        tasks=np.asarray(tasks),
-        returns=own,
-    )
+    own = [np.asarray(returns)[:, k, :, c] for k, c in enumerate(columns)]
+    return {
+        "obs": np.asarray(trials.transitions.next_obs),
+        "action": np.asarray(trials.transitions.action),
+        "seeds": np.asarray(seeds),
+        "tasks": np.asarray(tasks),
+        "returns": np.stack(own, 1),
+    }
 
 
 def describe(rows: Sequence[dict[str, Any]]) -> str:
@@ -94,3 +89,15 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
             parts.append(f"{name} {np.mean(own):.0f}")
     value = np.mean([row["value"] for row in rows])
     return "  ".join([f"value {value:.3g}", "returns:", *parts])
+
+
+def summary(
+    rows: Sequence[dict[str, Any]], tasks: Sequence[str], seconds: float
+) -> str:
+    """Returns the lines that end a zero-shot: the returns of every task."""
+    lines = [f"zero-shot returns ({seconds:.0f} s):"]
+    for task in tasks:
+        own = [row["return"] for row in rows if row["task"] == task]
+        each = " ".join(f"{value:.0f}" for value in own)
+        lines.append(f"  {task:<11}{sum(own) / len(own):8.0f}   trials: {each}")
+    return "\n".join(lines)

@@ -14,13 +14,13 @@ import jaxpets
 from experiments import loop
 from experiments.build import REFIT, State, trial_keys
 from experiments.config import Config
-from experiments.loop import Say
 from experiments.parallel import devices
 from experiments.parallel.devices import SEED
+from experiments.storage.folder import RunFolder
 
 
 def refit(
-    config: Config, fitter: jaxpets.Fitter, state: State, step: int, say: Say
+    config: Config, fitter: jaxpets.Fitter, state: State, step: int, run: RunFolder
 ) -> State:
     """Returns the learner `[S]` after one more fit.
 
@@ -29,9 +29,9 @@ def refit(
       fitter: made with these numbers.
       state: learner `[S]` explored until trial `step`; consumed.
       step: the keys depend on it.
-      say: gets one line.
+      run: says one line.
     """
-    spread = devices.spread(len(config.seeds))
+    placement = devices.spread(len(config.seeds))
 
     def learn(key: Array, state: State, nothing: tuple[()]) -> tuple[State, object]:
         del nothing  # a learner's new transitions
@@ -40,10 +40,10 @@ def refit(
 
     begin = time.monotonic()
     rows, epochs = int(state.dataset.size), config.refit.num_epochs
-    keys = devices.place(spread, trial_keys(config, REFIT, step), SEED)
-    state = devices.place(spread, state, SEED)
-    state, _ = loop.learner(spread, learn, SEED)(keys, state, ())
-    state = devices.collect(spread, jax.block_until_ready(state), SEED)
+    keys = devices.place(placement, trial_keys(config, REFIT, step), SEED)
+    state = devices.place(placement, state, SEED)
+    state, _ = loop.over_branches(placement, learn, SEED)(keys, state, ())
+    state = devices.collect(placement, jax.block_until_ready(state), SEED)
     seconds = time.monotonic() - begin
-    say(f"refit: {epochs} epochs of {rows:,} transitions  {seconds:.1f} s")
+    run.say(f"refit: {epochs} epochs of {rows:,} transitions  {seconds:.1f} s")
     return state

@@ -4,13 +4,14 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from experiments import cli, session
-from experiments.config import Config
+from experiments import cli
+from experiments.config import NUM_TASKS, Config
 from experiments.cost import check_cpu, memory_advice
-from experiments.entries import from_json, to_json
+from experiments.entries import differences, from_json, to_json
 from experiments.errors import (
     CheckpointError,
     InterruptedRun,
@@ -21,6 +22,12 @@ from experiments.errors import (
 )
 from experiments.parallel import distributed
 from experiments.progress import stoppable
+
+if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
+    from experiments.storage.folder import RunFolder
+
+# Two checkpoints and one being written, of a paper-sized run of one seed and task.
+_NEEDED_BYTES = 64 * 2**20
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-        with distributed.joined(cli.process_spec(arguments), _say):
+        with distributed.joined(cli.process_spec(arguments)):
             plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
@@ -52,22 +59,28 @@ def _dispatch(config: Config) -> None:
         from experiments.report import report
 
         for path in report.write_report(config.out, config.out / "report"):
-            _say(f"wrote {path}")
+            distributed.say(f"wrote {path}")
         return
-    source = cli.explored_run(config)
+    from experiments.storage.folder import RunFolder
+
+    source = RunFolder(cli.explored_run(config))
     check_cpu(config)
     if config.phase == "explore":
-        _explore(config, source)
+        with _opened(config, source.path) as run:
+            from experiments import phases
+
+            phases.explore(config, run)
+        run.say(f"next: python -m experiments.run --phase zero-shot --from {run.path}")
         return
-    step = distributed.on_first(lambda: _explored_step(config, source))
+    step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
-    with _without_gl(), stoppable(), _opened(config, folder):
+    with _opened(config, folder) as run:
         from experiments import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
-        phase(config, source, folder, step, _say)
+        phase(config, source, run, step)
     if config.video is not None and distributed.is_first():
-        _video(config, folder)
+        _video(config, run)
 
 
 def _variant(config: Config, step: int) -> str:
@@ -77,27 +90,29 @@ def _variant(config: Config, step: int) -> str:
     return "-".join([config.phase, f"{step:03d}", *task, *tag])
 
 
-def _explore(config: Config, folder: Path) -> None:
-    with _without_gl(), stoppable(), _opened(config, folder):
-        from experiments import phases
+@contextmanager
+def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
+    """Holds the folder of a run that a signal may stop."""
+    from experiments.storage import folder
 
-        phases.explore(config, folder, _say)
-    _say(f"next: python -m experiments.run --phase zero-shot --from {folder}")
+    plain = to_json(config)
+    branches = len(config.seeds)
+    if (config.phase, config.task) == ("finetune", "all"):
+        branches *= NUM_TASKS
+    size = _NEEDED_BYTES * branches
+    with (
+        _without_gl(),
+        stoppable(),
+        folder.open_run(path, plain, lambda old: differences(old, plain), size) as run,
+    ):
+        yield run
 
 
-def _opened(config: Config, folder: Path) -> AbstractContextManager[None]:
-    """Returns what holds a run's folder, on the process that has one."""
-    run = session.open_run(folder, to_json(config), say=_say)
-    return distributed.held_by_first(run)
-
-
-def _explored_step(config: Config, source: Path) -> int:
+def _explored_step(config: Config, source: "RunFolder") -> int:
     """Returns the trial whose checkpoint phase 2 starts from."""
-    from experiments.storage import checkpoint
-
-    steps = checkpoint.steps(source / "checkpoints")
+    steps = source.steps()
     if not steps:
-        raise CheckpointError(f"there is no checkpoint in {source}.")
+        raise CheckpointError(f"there is no checkpoint in {source.path}.")
     step = config.at_trial if config.at_trial is not None else steps[-1]
     if step not in steps:
         kept = ", ".join(map(str, steps))
@@ -105,7 +120,7 @@ def _explored_step(config: Config, source: Path) -> int:
     return step
 
 
-def _video(config: Config, folder: Path) -> None:
+def _video(config: Config, run: "RunFolder") -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
     from experiments.tools import video
     from jaxpets.envs.half_cheetah import TASK_NAMES
@@ -118,16 +133,16 @@ def _video(config: Config, folder: Path) -> None:
             target = target.with_stem(f"{target.stem}-{name}")
         try:
             video.render(
-                folder / "trajectories.npz",
+                run.trajectories,
                 target,
                 task=name,
                 seed=config.seeds[0],
                 trial=1,
             )
         except RunError as error:
-            _say(f"warning: no video; the run is complete: {error}")
+            distributed.say(f"warning: no video; the run is complete: {error}")
             return
-        _say(f"wrote {target}")
+        distributed.say(f"wrote {target}")
 
 
 @contextmanager
@@ -159,11 +174,6 @@ def _without_gl() -> Iterator[None]:
         del os.environ["MUJOCO_GL"]
         if chosen is not None:
             os.environ["MUJOCO_GL"] = chosen
-
-
-def _say(text: str) -> None:
-    if distributed.is_first():
-        print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

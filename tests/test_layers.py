@@ -1,6 +1,7 @@
 """Structure: who may import whom, what is public, what the library never does."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -178,6 +179,83 @@ def test_the_outside_uses_public_names_only(path):
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             assert node.attr != "_src", f"{path.name} reaches into _src"
+
+
+# The doors of experiments: what a room may import from the others. What is not here is
+# on top of them, and the commands in `tools` on top of all.
+ROOMS = {
+    "errors": set(),
+    "parallel": {"errors"},
+    "storage": {"errors", "parallel"},
+    "report": {"errors", "storage"},
+}
+# digests reads what any version wrote, without the code of any.
+ORBAX = {"storage.checkpoint", "tools.digests"}
+
+
+def experiments_imports():
+    """Returns for every module of experiments what else of them it imports."""
+    root = REPOSITORY / "experiments"
+    paths = {
+        ".".join(path.relative_to(root).with_suffix("").parts): path
+        for path in sorted(root.rglob("*.py"))
+        if path.name != "__init__.py"
+    }
+    found = {}
+    for name, path in paths.items():
+        dotted = {
+            name.removeprefix("experiments.")
+            for name in imports(ast.parse(path.read_text()))
+        }
+        found[name] = (dotted & paths.keys()) - {name}
+    return found
+
+
+EXPERIMENTS = experiments_imports()
+
+
+def room(name):
+    return name.partition(".")[0]
+
+
+def path_of(name):
+    return REPOSITORY.joinpath("experiments", *name.split(".")).with_suffix(".py")
+
+
+@pytest.mark.parametrize("name", [n for n in EXPERIMENTS if room(n) in ROOMS])
+def test_rooms_have_walls(name):
+    others = {room(other) for other in EXPERIMENTS[name]} - {room(name)}
+    assert others <= ROOMS[room(name)]
+
+
+def test_only_the_command_opens_the_tools():
+    users = {name for name, found in EXPERIMENTS.items() if "tools" in map(room, found)}
+    assert {name for name in users if room(name) != "tools"} <= {"run"}
+
+
+def test_no_circle_of_experiments():
+    graphlib.TopologicalSorter(EXPERIMENTS).prepare()
+
+
+def test_the_walls_are_seen():
+    assert {"acting", "storage.folder", "progress"} <= EXPERIMENTS["loop"]
+    assert {"phases", "report.report", "tools.video"} <= EXPERIMENTS["run"]
+    assert set(ROOMS) <= {room(name) for name in EXPERIMENTS}
+
+
+def test_orbax_has_one_home():
+    paths = {name: path_of(name) for name in EXPERIMENTS}
+    found = {
+        name
+        for name, path in paths.items()
+        if any(x.split(".")[0] == "orbax" for x in imports(ast.parse(path.read_text())))
+    }
+    assert found == ORBAX
+
+
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS))
+def test_sizes_stay_small_outside(name):
+    assert len(path_of(name).read_text().splitlines()) <= 300
 
 
 @pytest.mark.parametrize("module", MODULES_OF_NAMES)

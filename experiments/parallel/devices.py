@@ -22,7 +22,7 @@ _CHOSEN = "jax_default_device"
 SEED, TASK, TRIAL = AXES = ("seed", "task", "trial")
 
 
-class Spread(NamedTuple):
+class Placement(NamedTuple):
     """Branches `[S, K, R]` in blocks, one per host, and those in blocks per device."""
 
     counts: tuple[int, ...]  # S, K, R of the whole run
@@ -31,7 +31,7 @@ class Spread(NamedTuple):
     mesh: Mesh  # of devices of this host
 
 
-def spread(num_seeds: int, num_tasks: int = 1, num_trials: int = 1) -> Spread:
+def spread(num_seeds: int, num_tasks: int = 1, num_trials: int = 1) -> Placement:
     """Spreads branches over as many hosts and devices as divide them.
 
     A host that cannot have a block of its own repeats another's, for nothing.
@@ -43,7 +43,7 @@ def spread(num_seeds: int, num_tasks: int = 1, num_trials: int = 1) -> Spread:
     devices = _devices()
     shape = grid(here, len(devices))
     mesh = Mesh(np.array(devices[: math.prod(shape)]).reshape(shape), AXES)
-    return Spread(counts, parts, tuple(int(i) for i in host), mesh)
+    return Placement(counts, parts, tuple(int(i) for i in host), mesh)
 
 
 def grid(counts: tuple[int, ...], limit: int) -> tuple[int, ...]:
@@ -57,93 +57,93 @@ def grid(counts: tuple[int, ...], limit: int) -> tuple[int, ...]:
     return max(fitting, key=lambda g: (math.prod(g), g))
 
 
-def idle(spread: Spread) -> str | None:
+def idle(placement: Placement) -> str | None:
     """Says in one line which devices have nothing of their own to do."""
     there = jax.process_count() * len(_devices())
-    used = math.prod(spread.hosts) * spread.mesh.size
+    used = math.prod(placement.hosts) * placement.mesh.size
     if used == there:
         return None
     names = ("seeds", "tasks", "trials")
-    what = [f"{c} {n}" for c, n in zip(spread.counts, names, strict=True) if c > 1]
+    what = [f"{c} {n}" for c, n in zip(placement.counts, names, strict=True) if c > 1]
     return (
         f"using {used} of {there} devices; {' x '.join(what) or '1 seed'} cannot be "
         "spread over more in equal parts."
     )
 
 
-def each(spread: Spread, axis: str) -> int:
+def each(placement: Placement, axis: str) -> int:
     """Returns how many seeds, tasks or trials a single device has."""
     i = AXES.index(axis)
-    return spread.counts[i] // spread.hosts[i] // spread.mesh.shape[axis]
+    return placement.counts[i] // placement.hosts[i] // placement.mesh.shape[axis]
 
 
 def split(
-    spread: Spread, function: Callable[..., Any], takes: Any, gives: Any
+    placement: Placement, function: Callable[..., Any], takes: Any, gives: Any
 ) -> Callable[..., Any]:
     """Returns `function`, called on every device with its own block.
 
     Args:
-      spread: one device of this host leaves the function as it is.
+      placement: one device of this host leaves the function as it is.
       function: not jitted.
       takes: a prefix of the arguments' pytree: PartitionSpecs over the axes.
       gives: the same of the results.
     """
-    if spread.mesh.size == 1:
+    if placement.mesh.size == 1:
         return function
     # Unchecked: what is not sharded, as the size of the datasets, is equal on all.
     return jax.shard_map(
-        function, mesh=spread.mesh, in_specs=takes, out_specs=gives, check_vma=False
+        function, mesh=placement.mesh, in_specs=takes, out_specs=gives, check_vma=False
     )
 
 
-def place(spread: Spread, tree: Any, *axes: str) -> Any:
+def place(placement: Placement, tree: Any, *axes: str) -> Any:
     """Puts this host's part of the whole on its devices.
 
     Args:
-      spread: one host with one device leaves the arrays where they are.
+      placement: one host with one device leaves the arrays where they are.
       tree: arrays whose leading axes are `axes`, or without any axis.
       axes: of AXES.
     """
 
     def one(x: jax.Array) -> jax.Array:
         spec = P(*axes) if x.ndim else P()
-        if spread.mesh.size > 1:
-            return jax.device_put(x, NamedSharding(spread.mesh, spec))
+        if placement.mesh.size > 1:
+            return jax.device_put(x, NamedSharding(placement.mesh, spec))
         return x
 
-    if math.prod(spread.hosts) > 1:
-        tree = block(spread, tree, *axes)
+    if math.prod(placement.hosts) > 1:
+        tree = block(placement, tree, *axes)
     return jax.tree.map(one, tree)
 
 
-def block(spread: Spread, tree: Any, *axes: str) -> Any:
+def block(placement: Placement, tree: Any, *axes: str) -> Any:
     """Returns this host's part of the whole."""
     ours = []
     for axis in axes:
         i = AXES.index(axis)
-        size = spread.counts[i] // spread.hosts[i]
-        ours.append(slice(spread.host[i] * size, (spread.host[i] + 1) * size))
+        size = placement.counts[i] // placement.hosts[i]
+        ours.append(slice(placement.host[i] * size, (placement.host[i] + 1) * size))
     return jax.tree.map(lambda x: x[tuple(ours)] if x.ndim else x, tree)
 
 
-def collect(spread: Spread, tree: Any, *axes: str) -> Any:
+def collect(placement: Placement, tree: Any, *axes: str) -> Any:
     """Returns the whole, on every host: what `place` has taken apart.
 
     NumPy arrays, unless one host with one device has everything anyway.
     """
-    if jax.process_count() == 1 == spread.mesh.size:
+    if jax.process_count() == 1 == placement.mesh.size:
         return tree
     # In one layout: NumPy's sums depend on it.
     tree = jax.tree.map(lambda x: np.array(x, order="C"), jax.device_get(tree))
     if jax.process_count() == 1:
         return tree
-    whole = join(spread, distributed.gather(tree), *axes)
+    whole = join(placement, distributed.gather(tree), *axes)
     return jax.tree.map(lambda x: np.array(x, order="C"), whole)
 
 
-def join(spread: Spread, tree: Any, *axes: str) -> Any:
+def join(placement: Placement, tree: Any, *axes: str) -> Any:
     """Puts the blocks of all hosts, `[hosts, ...]`, together again."""
-    parts = [spread.hosts[AXES.index(axis)] for axis in axes]
+    parts = [placement.hosts[AXES.index(axis)] for axis in axes]
 
     def one(x: np.ndarray) -> np.ndarray:
         if x.ndim == 1:
@@ -152,7 +152,7 @@ def join(spread: Spread, tree: Any, *axes: str) -> Any:
         n = len(parts)  # now parts, then blocks; wanted is part, block, part, block
         order = [i + n * inner for i in range(n) for inner in (0, 1)]
         x = x.transpose(*order, *range(2 * n, x.ndim))
-        sizes = [spread.counts[AXES.index(axis)] for axis in axes]
+        sizes = [placement.counts[AXES.index(axis)] for axis in axes]
         return x.reshape(*sizes, *x.shape[2 * n :])
 
     return jax.tree.map(one, tree)

@@ -8,17 +8,16 @@ import atexit
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
 from experiments import errors
 from experiments.errors import OutOfMemoryError, RunError, UsageError
-from experiments.storage.pytrees import describe, from_host, to_host
 
 
 class ProcessSpec(NamedTuple):
@@ -29,8 +28,14 @@ class ProcessSpec(NamedTuple):
     process_id: int | None
 
 
+def say(text: str) -> None:
+    """Prints a line for the user, once for all processes."""
+    if is_first():
+        print(text, file=sys.stderr, flush=True)
+
+
 @contextlib.contextmanager
-def joined(spec: ProcessSpec | None, say: Callable[[str], None]) -> Iterator[None]:
+def joined(spec: ProcessSpec | None) -> Iterator[None]:
     """Makes this process one of several for a while; None leaves it alone.
 
     Raises:
@@ -71,14 +76,22 @@ def _leave() -> None:
     jax.distributed.shutdown()
 
 
+def is_alone() -> bool:
+    """Returns whether there is no other process.
+
+    Asked in a way that starts no backend: usage errors come before that.
+    """
+    return not jax.distributed.is_initialized()
+
+
 def is_first() -> bool:
     """Returns whether this process has the run's folder and the screen."""
-    return _alone() or jax.process_index() == 0
+    return is_alone() or jax.process_index() == 0
 
 
 def on_first(call: Callable[[], Any]) -> Any:
     """Calls on process 0 only; all processes get the JSON value or the RunError."""
-    if _alone():
+    if is_alone():
         return call()
     answer, failure = {}, None
     if is_first():
@@ -108,26 +121,17 @@ def held_by_first(manager: contextlib.AbstractContextManager[None]) -> Iterator[
         yield
 
 
-def share(state: Any, template: Any) -> Any:
-    """Gives every process the state of process 0.
+def share(tree: Any) -> Any:
+    """Gives every process the NumPy arrays of process 0.
 
     Args:
-      state: read on process 0 only.
-      template: the state's pytree, arrays or `jax.ShapeDtypeStruct`s.
+      tree: of the same types everywhere; elsewhere its values do not count.
     """
-    if _alone():
-        return state
-    arrays = {
-        name: np.zeros(leaf.shape, jnp.dtype(leaf.dtype))
-        for name, leaf in describe(template).items()
-    }
-    if is_first():
-        saved = to_host(state)
-        arrays = {name: saved[name] for name in arrays}  # its order may be another
-    data = _from_first(_packed(arrays.values()))
-    values = _unpacked(data[None], arrays.values())
-    here = {name: x[0] for name, x in zip(arrays, values, strict=True)}
-    return from_host(here, template)
+    if is_alone():
+        return tree
+    leaves, structure = jax.tree.flatten(tree)
+    data = _from_first(_packed(leaves))
+    return structure.unflatten(x[0] for x in _unpacked(data[None], leaves))
 
 
 def gather(tree: Any) -> Any:
@@ -139,14 +143,9 @@ def gather(tree: Any) -> Any:
 
 def agree(number: int) -> int:
     """Returns the largest number that any process has brought."""
-    if _alone():
+    if is_alone():
         return number
     return int(multihost_utils.process_allgather(np.array(number, np.int32)).max())
-
-
-def _alone() -> bool:
-    """Asks in a way that starts no backend: usage errors come before that."""
-    return not jax.distributed.is_initialized()
 
 
 def _from_first(array: np.ndarray) -> np.ndarray:

@@ -9,8 +9,9 @@ import numpy as np
 
 from experiments.config import Config, Evaluation, Exploration, Mark, Tuning
 from experiments.entries import entries
-from experiments.report.logs import Row, Scores, number, read_json
+from experiments.report.logs import Row, Scores, number
 from experiments.report.tables import ARMS, TASKS, flat, in_order
+from experiments.storage import rundir
 
 # What a phase depends on; the rest it keeps in its config for the phases after it.
 _DEPENDS_ON = {
@@ -125,7 +126,7 @@ def _not_finite(rows: Sequence[Row]) -> Iterator[str]:
 
 def _torn(runs: Iterable[Path]) -> Iterator[str]:
     for run in sorted(runs):
-        if not (run / "metrics.jsonl").read_bytes().endswith(b"\n"):
+        if not (run / rundir.METRICS).read_bytes().endswith(b"\n"):
             yield f"The last line of {run.name}/metrics.jsonl is cut off; left out."
 
 
@@ -138,7 +139,7 @@ def _unequal(runs: dict[Path, str]) -> Iterator[str]:
         for run in sorted(run for run in runs if runs[run] == phase):
             label = run.parent.name if phase != "explore" else run.name
             labels.add(label)
-            for name, value in flat(read_json(run / "config.json")).items():
+            for name, value in flat(rundir.find_json(run / rundir.CONFIG)).items():
                 if settings.get(name, True):
                     by_value = values.setdefault(name, {})
                     by_value.setdefault(str(value), set()).add(label)

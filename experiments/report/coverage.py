@@ -5,15 +5,18 @@ A complete exploration run has it in coverage.json: `velocity_edges` in m/s,
 ended in each cell, a row per bin of velocity. The outermost bins are open.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from experiments.errors import UsageError
 from experiments.report import logs
-from experiments.storage import rundir
+from experiments.storage import metrics, rundir
+
+if TYPE_CHECKING:  # it brings orbax
+    from experiments.storage.folder import RunFolder
 
 VELOCITY_EDGES = tuple(i / 2 for i in range(-16, 17))  # m/s
 PITCH_RATE_EDGES = tuple(float(i) for i in range(-15, 16))  # rad/s
@@ -53,41 +56,29 @@ def histogram(next_obs: np.ndarray) -> np.ndarray:
 
 
 def write(
-    folder: Path, seeds: Sequence[int], template: Any, step: int, *, anew: bool,
-    warn: Callable[[str], None],
-) -> None:  # fmt: skip
+    run: "RunFolder", seeds: Sequence[int], template: Any, step: int, *, anew: bool
+) -> None:
     """Writes coverage.json of a complete exploration run, from its last checkpoint.
 
     Args:
-      folder: of the run.
+      run: where the exploration is.
       seeds: S, in the order of the learner's leading axis.
       template: the dataset of a learner `[S]`, as shapes, and nothing else of it.
       step: the last trial.
       anew: whether to replace the file if it is there.
-      warn: gets each warning as one line.
 
     Raises:
       CheckpointError, StorageError: if the one cannot be read or the other written.
     """
-    from experiments.storage import checkpoint
-
-    if (folder / _FILE).exists() and not anew:
+    if run.has(_FILE) and not anew:
         return
-    found = checkpoint.restore(
-        folder / "checkpoints", template, step=step, part=True, warn=warn
-    )
-    assert found is not None  # a step that is asked for and is not there is an error
-    dataset = found[1].dataset
+    dataset = run.restore_trial(step, template, part=True).dataset
     filled = np.asarray(dataset.data.next_obs)[:, : int(dataset.size)]
-    data = {
-        "velocity_edges": VELOCITY_EDGES,
-        "pitch_rate_edges": PITCH_RATE_EDGES,
-        "counts": {
-            seed: histogram(next_obs)
-            for seed, next_obs in zip(seeds, filled, strict=True)
-        },
+    counts = {
+        seed: histogram(next_obs) for seed, next_obs in zip(seeds, filled, strict=True)
     }
-    rundir.write_json(folder / _FILE, data)
+    edges = {"velocity_edges": VELOCITY_EDGES, "pitch_rate_edges": PITCH_RATE_EDGES}
+    run.write_json(_FILE, {**edges, "counts": counts})
 
 
 def load(out: Path) -> dict[str, dict[str, Counts]]:
@@ -116,12 +107,12 @@ def load(out: Path) -> dict[str, dict[str, Counts]]:
 
 
 def _read(path: Path) -> _Found:
-    data = logs.read_json(path)
-    config = logs.read_json(path.parent / "config.json")
+    data = rundir.find_json(path)
+    config = rundir.find_json(path.parent / rundir.CONFIG)
     try:
         edges = tuple(data["velocity_edges"]), tuple(data["pitch_rate_edges"])
         counts = {int(seed): np.array(x, int) for seed, x in data["counts"].items()}
-        arm, preset = logs.label(config["arm"], config), config["preset"]
+        arm, preset = metrics.arm_label(config["arm"], config), config["preset"]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path} is no coverage of a run ({error!r}).") from error
     shape = len(VELOCITY_EDGES) - 1, len(PITCH_RATE_EDGES) - 1

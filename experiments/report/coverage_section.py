@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.errors import UsageError
-from experiments.report import coverage, figures, logs, tables
+from experiments.report import coverage, figures, tables
 from experiments.report.coverage import Counts
+from experiments.storage import rundir
 
 _COVERAGE = (
     "Where the transitions of exploration ended: bins of 0.5 m/s by 1 rad/s, the "
@@ -63,7 +64,7 @@ def model_error(path: Path, preset: str) -> list[str]:
     """
     if not path.exists():
         return []
-    found = logs.read_json(path)
+    found = rundir.find_json(path)
     try:
         if found["preset"] != preset:
             return []

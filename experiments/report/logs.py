@@ -1,31 +1,17 @@
 """Reads the logs of runs, and picks scores and curves out of them."""
 
-import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from experiments.errors import UsageError
+from experiments.storage import metrics, rundir
+from experiments.storage.metrics import Row, number
 
 Points = dict[int, dict[int, float]]  # trial -> seed -> number
 Scores = dict[str, dict[str, dict[int, float]]]  # arm -> task -> seed -> score
-
-
-class Row(NamedTuple):
-    """A line of metrics.jsonl, with what its run says about it."""
-
-    preset: str
-    arm: str  # with the number of bits for count: count-32
-    phase: str
-    seed: int
-    task: str  # empty while exploring
-    trial: int
-    explored: int  # exploration trials behind the model; 0 while exploring
-    tag: str  # of a variant of phase 2; empty for the one that Table 1 counts
-    data: dict[str, Any]
-    run: Path  # folder of the log
 
 
 def load(out: Path) -> list[Row]:
@@ -38,8 +24,8 @@ def load(out: Path) -> list[Row]:
       UsageError: if there is no log, a line that is no row, or two rows for one seed,
         task and trial of an arm: averaging them would count a seed twice.
     """
-    logs = files(out, "metrics.jsonl")
-    rows = [row for log in logs if not _is_part(log) for row in _read(log)]
+    logs = [log for log in files(out, rundir.METRICS) if not _is_part(log)]
+    rows = [row for log in logs for row in metrics.read(log, _config(log.parent))]
     if not rows:
         raise UsageError(f"there is no metrics.jsonl with a row under {out}.")
     seen: dict[tuple[Any, ...], Row] = {}
@@ -64,63 +50,18 @@ def files(out: Path, name: str) -> list[Path]:
     ]
 
 
-def label(arm: str, config: Mapping[str, Any]) -> str:
-    """Returns what the report calls an arm: count has its number of bits, count-32."""
-    if arm == "count" and "num_bits" in config:
-        return f"count-{config['num_bits']}"
-    return arm
-
-
 def _is_part(log: Path) -> bool:
     """Tells if the folder beside this one has done all tasks, this one among them."""
     folder = log.parent
-    task = read_json(folder / "config.json").get("task", "all")
+    task = _config(folder).get("task", "all")
     if task == "all":
         return False
     whole = folder.with_name(folder.name.replace(f"-{task}", "", 1)) / log.name
     return whole != log and whole.exists() and whole.stat().st_size > 0
 
 
-def _read(log: Path) -> Iterator[Row]:
-    config = read_json(log.parent / "config.json")
-    lines = log.read_text().splitlines(keepends=True)
-    for i, line in enumerate(lines, 1):
-        if not line.endswith("\n"):
-            return
-        try:
-            yield _row(json.loads(line), config, log.parent)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UsageError(f"{log}:{i} is no row of a run ({error!r}).") from error
-
-
-def _row(data: dict[str, Any], config: dict[str, Any], run: Path) -> Row:
-    exploring = data["phase"] == "explore"
-    return Row(
-        preset=config["preset"],
-        arm=label(data["arm"], config),
-        phase=data["phase"],
-        seed=int(data["seed"]),
-        task="" if exploring else data["task"],
-        trial=int(data["trial"]),
-        explored=0 if exploring else int(data["explored_trials"]),
-        tag=config.get("tag") or "",
-        data=data,
-        run=run,
-    )
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Returns the object in a file, or an empty one if there is none to read."""
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-def number(value: Any) -> float:
-    """Returns a logged number; null, which stands for one not finite, is NaN."""
-    return float("nan") if value is None else float(value)
+def _config(folder: Path) -> dict[str, Any]:
+    return rundir.find_json(folder / rundir.CONFIG)
 
 
 def named_by_tag(rows: Iterable[Row]) -> list[Row]:

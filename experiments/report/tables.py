@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from experiments.report import stats
-from experiments.report.logs import Points, Scores, read_json
+from experiments.report.logs import Points, Scores
+from experiments.storage import rundir
 
 TASKS = ("forward", "backward", "front-flip", "back-flip")
 ARMS = ("epistemic", "count", "random", "oracle", "one-step")
@@ -256,9 +257,9 @@ def environments(runs: Mapping[str, Path]) -> list[str]:
     """Returns device and versions, as env.json says, and how each run stands."""
     groups: dict[str, list[list[str]]] = {}
     for run, folder in runs.items():
-        env = flat(read_json(folder / "env.json"))
+        env = flat(rundir.find_json(folder / rundir.ENVIRONMENT))
         text = ", ".join(f"{k} {v}" for k, v in env.items() if v not in (None, ""))
-        status = read_json(folder / "status.json")
+        status = rundir.find_json(folder / rundir.STATUS)
         state, time = (str(status.get(k, "not logged")) for k in ("state", "time"))
         groups.setdefault(text, []).append([f"`{run}`", state, time])
     lines = []

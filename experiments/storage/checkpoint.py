@@ -1,16 +1,18 @@
 """Checkpoints that are whole or absent: the only home of orbax.
 
-A step is a folder with two orbax items: `state`, a flat dictionary of arrays, and
-`meta`, a record of the leaves, their checksums and what the caller wants to remember.
-It gets its number by one rename, after it was written, sealed, read back, compared and
-forced to the disk. Orbax itself detects no flipped bit in an array, and a save of its
-in the background is lost, with exit code 0, when the program ends before it does.
+A step has two orbax items: `state`, a flat dictionary of arrays, and `meta`, a record
+of their types and of what the caller wants to remember. Orbax's manager writes, keeps,
+drops and restores the steps. Orbax itself notices no flipped bit in an array, so before
+a step gets its number, by one rename, its files are sealed, read back, compared with
+the state and forced to the disk.
 
 One process may write at a time (`rundir.lock`); reading is always safe.
 """
 
+import asyncio
 import contextlib
 import errno
+import json
 import logging
 import os
 import warnings
@@ -21,24 +23,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as policies
 
+import jaxpets
 from experiments.errors import CheckpointError, DivergedError, StorageError
-from experiments.storage import step_folders
-from experiments.storage.checksums import broken, seal
-from experiments.storage.disk import (
-    disk_error,
-    free_bytes,
-    is_full,
-    megabytes,
-    sync,
-    sync_tree,
-)
-from experiments.storage.manifest import digest, manifest, misfit, stored_leaves
-from experiments.storage.pytrees import describe, from_host, non_finite, to_host
-from experiments.storage.step_folders import steps, supersede
+from experiments.storage import disk, pytrees, step_folders
+from experiments.storage.step_folders import broken, names, seal, steps
 
-__all__ = ["restore", "save", "steps", "supersede"]
+__all__ = ["restore", "save", "steps"]
 
+SCHEMA = 2  # 1 has a checksum of every array as well
 _FIRST = ocp.options.MultiprocessingOptions(0, {0}, "first")  # no other host is here
 
 
@@ -47,260 +41,215 @@ class _DamagedError(Exception):
 
 
 def save(
-    directory: Path,
-    step: int,
-    state: Any,
-    meta: Mapping[str, Any],
-    *,
-    finite: Any = None,
-    keep: int = 2,
-    milestones: Collection[int] = (),
-) -> None:
+    directory: Path, step: int, state: Any, meta: Mapping[str, Any], *,
+    finite: Any = None, keep: int = 2, milestones: Collection[int] = (),
+) -> None:  # fmt: skip
     """Writes one step and returns when it is on the disk; then drops old ones.
 
     Args:
-      directory: Of all steps; created if need be.
-      step: Newer than every step there.
-      state: A pytree of arrays, on any device; typed keys are fine.
+      directory: of all steps; created if need be.
+      step: newer than every step there.
+      state: a pytree of arrays, on any device; typed keys are fine.
       meta: JSON values to come back from `restore`; no NaN.
-      finite: A part of the state whose floats must be finite.
-      keep: Number of newest steps to keep, the new one included.
-      milestones: Older steps that are never dropped.
+      finite: a part of the state whose floats must be finite.
+      keep: number of newest steps to keep, the new one included.
+      milestones: older steps that are never dropped.
 
     Raises:
-      DivergedError, StorageError: Not finite, or the disk failed; nothing has changed.
-      CheckpointError: There is a step as new as this one.
+      CheckpointError: if there is a step as new as this one.
+      DivergedError, StorageError: not finite, or the disk failed; nothing has changed.
     """
     if keep < 1:
         raise ValueError(f"keep must be at least 1, got {keep}")
     directory = Path(directory).resolve()
-    step_folders.require_newest(directory, step)
-    _require_finite(directory, step, finite)
-    arrays = to_host(state)
-    body = manifest(step, describe(state), arrays, meta)
+    if newer := [number for number in names(directory) if number >= step]:
+        raise CheckpointError(
+            f"checkpoint {step} would not be the newest in {directory} (there: "
+            f"{_listed(newer)}). Resume from the newest, or move these away."
+        )
+    good = _listed(steps(directory)[-1:])
+    if where := pytrees.non_finite(finite):
+        where = f"not finite at checkpoint {step}: {where}"
+        raise DivergedError(f"{where}. Last good checkpoint: {good}.")
+    arrays, leaves = pytrees.to_host(state), pytrees.describe(state)
+    record = {"schema": SCHEMA, "jaxpets": jaxpets.__version__, "step": step}
+    record = json.dumps(record | {"leaves": leaves, "meta": meta}, allow_nan=False)
+    size = 200_000 + sum(x.nbytes for x in arrays.values())  # orbax compresses them
+    kept = [policies.LatestN(keep), policies.CustomSteps(list(milestones))]
     try:
-        _commit(directory, step, arrays, body)
-    except Exception as error:
+        directory.mkdir(parents=True, exist_ok=True)
         step_folders.sweep(directory)
-        if message := _disk_message(directory, step, arrays, error):
-            raise StorageError(message) from error
+        if disk.free_bytes(directory) < size:
+            # Orbax would find out too, after pages of its threads' tracebacks.
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        _write(directory, step, arrays, json.loads(record), kept)
+    except Exception as error:
+        if what := _what_failed(error, directory, f"checkpoint {step}", size):
+            good = "No earlier one" if good == "none" else f"Checkpoint {good}"
+            advice = "free space or check the disk, and run the same command."
+            raise StorageError(f"{what}. {good} is intact; {advice}") from error
         raise
-    step_folders.prune(directory, keep, milestones)
+    finally:
+        step_folders.sweep(directory)
 
 
 def restore(
-    directory: Path,
-    template: Any,
-    *,
-    step: int | None = None,
-    part: bool = False,
-    warn: Callable[[str], None],
-) -> tuple[int, Any, dict[str, Any]] | None:
-    """Reads the newest step that is undamaged, or exactly `step`.
+    directory: Path, template: Any, *,
+    step: int | None = None, part: bool = False, warn: Callable[[str], None],
+) -> tuple[int, Any, dict[str, Any]] | None:  # fmt: skip
+    """Returns the newest step that is undamaged, or exactly `step`: it, state and meta.
 
     Damaged steps newer than the one read are set aside as `.corrupt-<step>`, with one
     warning each. If none can be read, none is moved: the directory is not a new one.
+    None if there is no checkpoint at all.
 
     Args:
-      directory: As in `save`.
-      template: The state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device.
-      step: The one to read, or None for the newest.
-      part: Whether the template may be a part of what was saved, with the same paths.
-      warn: Gets each warning as one line.
-
-    Returns:
-      The step, the state and the meta; None if there is no checkpoint at all.
+      directory: as in `save`.
+      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device.
+      step: the one to read, or None for the newest.
+      part: whether the template may be a part of what was saved, with the same paths.
+      warn: gets each warning as one line.
 
     Raises:
-      CheckpointError: Nothing there can be used; the message says why.
+      CheckpointError: if nothing there can be used; the message says why.
     """
     directory = Path(directory).resolve()
-    candidates = _candidates(directory, step)
-    if not candidates:
-        return None
-    damaged = {}
-    for number in candidates:
+    damaged: dict[int, str] = {}
+    for number in [n for n in names(directory)[::-1] if step in (None, n)]:
         try:
             state, meta = _read(directory, number, template, part)
         except _DamagedError as error:
             damaged[number] = str(error)
             continue
-        for bad, reason in damaged.items():
+        for bad, why in damaged.items():
             fate = step_folders.quarantine(directory, bad)
-            warn(f"checkpoint {bad} is damaged ({reason}); {fate}, using {number}.")
+            warn(f"checkpoint {bad} is damaged ({why}); {fate}, using {number}.")
         return number, state, meta
-    raise _no_use(directory, step, damaged)
-
-
-def _candidates(directory: Path, step: int | None) -> list[int]:
-    """Returns the steps to try, best first."""
-    numbers = step_folders.numbered(directory)
-    if step is None:
-        return numbers[::-1]
-    if step in numbers:
-        return [step]
-    there = ", ".join(map(str, steps(directory))) or "none"
-    raise CheckpointError(
-        f"no checkpoint {step} in {directory} (there: {there}). Choose another."
-    )
-
-
-def _no_use(
-    directory: Path, step: int | None, damaged: Mapping[int, str]
-) -> CheckpointError:
-    """Returns the error for a directory without a readable step."""
     if step is not None:
-        others = [number for number in steps(directory) if number != step]
-        return CheckpointError(
-            f"checkpoint {step} in {directory} is damaged ({damaged[step]}). Choose "
-            f"another (there: {', '.join(map(str, others)) or 'none'})."
+        others = _listed([number for number in steps(directory) if number != step])
+        what = f"checkpoint {step} in {directory}"
+        what = f"{what} is damaged ({damaged[step]})" if damaged else f"no {what}"
+        raise CheckpointError(f"{what}. Choose another (there: {others}).")
+    if damaged:
+        reasons = "; ".join(f"{number}: {why}" for number, why in damaged.items())
+        raise CheckpointError(
+            f"all {len(damaged)} checkpoints in {directory} are damaged ({reasons}). "
+            "Start over in another run directory; the files were kept."
         )
-    reasons = "; ".join(f"{number}: {reason}" for number, reason in damaged.items())
-    return CheckpointError(
-        f"all {len(damaged)} checkpoints in {directory} are damaged ({reasons}). Start "
-        "over in another run directory; the files were kept."
-    )
+    return None
 
 
-# Writing.
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers)) or "none"
 
 
-def _require_finite(directory: Path, step: int, part: Any) -> None:
-    if where := non_finite(part):
-        good = step_folders.last_good(directory, step)
-        raise DivergedError(
-            f"not finite at checkpoint {step}: {where}. Last good checkpoint: "
-            f"{'none' if good is None else good}."
-        )
-
-
-def _commit(
-    directory: Path,
-    step: int,
-    arrays: Mapping[str, np.ndarray],
-    body: Mapping[str, Any],
+def _write(
+    directory: Path, step: int, arrays: dict[str, np.ndarray], record: Any, kept: Any
 ) -> None:
-    """Writes a step under a temporary name, checks it, and gives it its number."""
-    directory.mkdir(parents=True, exist_ok=True)
-    step_folders.sweep(directory)
-    if free_bytes(directory) < _size(arrays):
-        # Orbax would find out too, after pages of its threads' tracebacks.
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    draft = directory / f".saving-{step}"
-    items = ocp.args.Composite(
-        state=ocp.args.StandardSave(_storable(arrays)), meta=ocp.args.JsonSave(body)
-    )
-    with _quiet_orbax() as orbax:
-        orbax.save(draft, args=items)
-    for note in draft.rglob("commit_success.txt"):
-        note.write_text("whole\n")  # orbax says there where on this machine it wrote
-    seal(draft)
-    _read_arrays(draft, _read_manifest(draft, step))
-    sync_tree(draft)
-    draft.rename(directory / str(step))
-    sync(directory)
+    """Lets orbax write a step, then drop those that no policy of `kept` keeps."""
+    # Orbax refuses arrays of size zero; the record has their shape.
+    stored = {name: array for name, array in arrays.items() if array.size}
+    items = {"state": ocp.args.StandardSave(stored), "meta": ocp.args.JsonSave(record)}
+    with _manager(
+        directory,
+        preservation_policy=policies.AnyPreservationPolicy(kept),
+        temporary_path_class=_draft_of(stored),
+        todelete_subdir=step_folders.DELETED,
+    ) as manager:
+        manager.save(step, args=ocp.args.Composite(**items), force=True)
 
 
-def _size(arrays: Mapping[str, np.ndarray]) -> int:
-    """Returns an upper bound of the bytes of a step: orbax compresses the arrays."""
-    return 200_000 + sum(array.nbytes for array in arrays.values())
+def _draft_of(stored: dict[str, np.ndarray]) -> type:
+    """Returns the kind of folder that orbax writes to: checked before its rename."""
+
+    def check(draft: Path) -> None:
+        seal(draft)
+        if why := broken(draft):
+            raise _DamagedError(why)
+        with ocp.StandardCheckpointer(multiprocessing_options=_FIRST) as reader:
+            found = reader.restore(draft / "state")
+        for name, array in stored.items():
+            same = found[name].dtype == array.dtype and found[name].shape == array.shape
+            if not same or found[name].tobytes() != array.tobytes():
+                raise _DamagedError(f"{name} is not what was saved")
+        disk.sync_tree(draft)
+
+    class Draft(ocp.path.atomicity.AtomicRenameTemporaryPath):
+        async def finalize(self) -> None:
+            draft, final = Path(self.get()), Path(self.get_final())
+            if final.name.isdecimal():  # the step; its items come before
+                await asyncio.to_thread(check, draft)
+            draft.rename(final)
+            disk.sync(final.parent)
+
+    return Draft
 
 
-def _disk_message(
-    directory: Path, step: int, arrays: Mapping[str, np.ndarray], error: Exception
-) -> str | None:
-    """Returns the line for a save that the disk failed; None if it is a bug of ours."""
-    number = disk_error(error)
+def _what_failed(error: Exception, directory: Path, step: str, size: int) -> str | None:
+    """Says what the disk did to a save; None if it is a bug of ours."""
     if isinstance(error, _DamagedError):
-        what = f"checkpoint {step} in {directory} did not read back ({error})"
-    elif number is None:
+        return f"{step} in {directory} did not read back ({error})"
+    if (number := disk.disk_error(error)) is None:
         return None
-    else:
-        reason = "no space for" if is_full(number) else f"{os.strerror(number)} writing"
-        needs, free = megabytes(_size(arrays)), megabytes(free_bytes(directory))
-        what = f"{reason} checkpoint {step} in {directory} (needs {needs}, {free} free)"
-    good = step_folders.last_good(directory, step)
-    intact = "No earlier one" if good is None else f"Checkpoint {good}"
-    return (
-        f"{what}. {intact} is intact; free space or check the disk, and run the same "
-        "command."
-    )
+    full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    reason = "no space for" if full else f"{os.strerror(number)} writing"
+    needs, free = map(disk.megabytes, (size, disk.free_bytes(directory)))
+    return f"{reason} {step} in {directory} (needs {needs}, {free} free)"
 
 
-# Reading.
-
-
-def _read(
-    directory: Path, number: int, template: Any, part: bool
-) -> tuple[Any, dict[str, Any]]:
-    """Reads and checks one step; raises CheckpointError if it does not fit."""
-    folder = directory / str(number)
+def _read(directory: Path, number: int, template: Any, part: bool) -> tuple[Any, Any]:
+    """Returns state and meta of one step; raises CheckpointError if it does not fit."""
+    meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
+    state = ocp.args.Composite(state=ocp.args.StandardRestore())
     try:
-        body = _read_manifest(folder, number)
-        if why := misfit(body, describe(template), part=part):
-            raise CheckpointError(f"checkpoint {number} in {directory} {why}")
-        arrays = _read_arrays(folder, body)
+        if why := broken(directory / str(number)):
+            raise _DamagedError(why)
+        with _manager(directory, read_only=True) as manager:
+            record = manager.restore(number, args=meta)["meta"]
+            if record["step"] != number:
+                raise _DamagedError(f"it is step {record['step']}")
+            if why := _misfit(record, template, part):
+                raise CheckpointError(f"checkpoint {number} in {directory} {why}")
+            arrays = manager.restore(number, args=state)["state"]
     except PermissionError as error:
-        raise StorageError(
-            f"cannot read checkpoint {number} in {directory} ({error.strerror}). "
-            "Check its permissions."
-        ) from error
-    return from_host(arrays, template), body["meta"]
-
-
-def _read_manifest(folder: Path, number: int) -> dict[str, Any]:
-    """Returns the record of a step, once it is known to be what was written."""
-    if why := broken(folder):
-        raise _DamagedError(why)
-    body = _read_items(folder, meta=ocp.args.JsonRestore()).meta
-    if body["step"] != number:
-        raise _DamagedError(f"it is step {body['step']}")
-    return body
-
-
-def _read_arrays(folder: Path, body: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Reads the arrays that a record lists, and checks each against its digest."""
-    arrays = {
-        name: np.zeros(leaf.shape, jnp.dtype(leaf.dtype))
-        for name, leaf in stored_leaves(body).items()
-    }
-    target = ocp.args.StandardRestore(_storable(arrays))
-    arrays |= _read_items(folder, state=target).state
-    for name, array in arrays.items():
-        if digest(array) != body["leaves"][name]["sha256"]:
-            raise _DamagedError(f"checksum of {name}")
-    return arrays
-
-
-def _storable(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Drops arrays of size zero, which orbax refuses; the record has their shape."""
-    return {name: array for name, array in arrays.items() if array.size}
-
-
-def _read_items(folder: Path, **items: Any) -> Any:
-    """Reads orbax items; whatever goes wrong in there means damage."""
-    try:
-        with _quiet_orbax() as orbax:
-            return orbax.restore(folder, args=ocp.args.Composite(**items))
-    except (MemoryError, PermissionError):
+        what = f"cannot read checkpoint {number} in {directory} ({error.strerror})"
+        raise StorageError(f"{what}. Check its permissions.") from error
+    except (MemoryError, CheckpointError, _DamagedError):
         raise
     except Exception as error:
         raise _DamagedError(f"unreadable: {type(error).__name__}") from error
+    for name, leaf in record["leaves"].items():
+        if 0 in leaf["shape"]:
+            arrays[name] = np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"]))
+    return pytrees.from_host(arrays, template), record["meta"]
+
+
+def _misfit(record: dict[str, Any], template: Any, part: bool) -> str | None:
+    """Says in one line why a record does not fit a template, or returns None."""
+    writer = f"written by jaxpets {record['jaxpets']}, schema {record['schema']}"
+    if record["schema"] > SCHEMA:
+        reader = f"this is jaxpets {jaxpets.__version__}, schema {SCHEMA}"
+        return f"cannot be read ({writer}; {reader}). Use the version that wrote it."
+    lines = pytrees.differences(record["leaves"], pytrees.describe(template), part=part)
+    if not lines:
+        return None
+    more = f"; and {len(lines) - 3} more" if len(lines) > 3 else ""
+    what = f"does not fit this run ({writer}): {'; '.join(lines[:3])}{more}"
+    return f"{what}. Use the same config or another run directory."
 
 
 @contextlib.contextmanager
-def _quiet_orbax() -> Iterator[ocp.Checkpointer]:
-    """Yields a new checkpointer; a failed read can spoil the next one of the same."""
-    alone = ocp.CompositeOptions(multiprocessing_options=_FIRST)
-    handler = ocp.CompositeCheckpointHandler(composite_options=alone)
+def _manager(directory: Path, **options: Any) -> Iterator[ocp.CheckpointManager]:
+    """Yields a manager that says nothing, and whose saves are over when they return."""
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
+    options |= {"create": False, "multiprocessing_options": _FIRST}
+    options |= {"enable_async_checkpointing": False, "lightweight_initialize": True}
     try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            ocp.Checkpointer(handler, multiprocessing_options=_FIRST) as orbax,
-        ):
-            yield orbax
+        with warnings.catch_warnings(action="ignore"):
+            chosen = ocp.CheckpointManagerOptions(**options)
+            with ocp.CheckpointManager(directory, options=chosen) as manager:
+                yield manager
     finally:
         logger.setLevel(level)

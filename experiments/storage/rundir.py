@@ -1,8 +1,4 @@
-"""The folder of a run: its lock, its JSON files and its metrics log.
-
-A log is JSON Lines. A checkpoint remembers the size of the log when it was written; a
-resumed run cuts the log back to there, so that each trial is in it once.
-"""
+"""The names in a run's folder, its lock, and its JSON files."""
 
 import contextlib
 import datetime
@@ -13,30 +9,27 @@ import os
 import re
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from experiments.errors import CheckpointError, StorageError, UsageError
-from experiments.storage.disk import free_bytes, megabytes, storage_errors, sync
-from experiments.storage.environment import compare_environment, environment
+from experiments.errors import (
+    CheckpointError,
+    StorageError,
+    UsageError,
+    storage_errors,
+)
+from experiments.storage.disk import free_bytes, megabytes, sync
 
-__all__ = [
-    "append_rows",
-    "check_name",
-    "compare_environment",
-    "cut_log",
-    "environment",
-    "lock",
-    "log_size",
-    "now",
-    "probe",
-    "read_json",
-    "write_json",
-]
+CONFIG = "config.json"
+ENVIRONMENT = "env.json"
+STATUS = "status.json"
+METRICS = "metrics.jsonl"
+CHECKPOINTS = "checkpoints"
+TRAJECTORIES = "trajectories.npz"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _MAX_JSON_BYTES = 1_000_000
@@ -126,11 +119,16 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
 
 def write_json(path: Path, data: Any) -> None:
     """Replaces a JSON file at once; a reader sees the old file or the new one."""
-    text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(plain(data), indent=2, allow_nan=False) + "\n"
+    replace_file(path, text.encode())
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Replaces a file at once, and on the disk; a failure leaves the old one."""
     draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with storage_errors(f"write {path}"):
         try:
-            draft.write_text(text, encoding="utf-8")
+            draft.write_bytes(data)
             sync(draft)
             draft.replace(path)
         finally:
@@ -162,77 +160,27 @@ def read_json(path: Path) -> Any:
     raise CheckpointError(f"{path} cannot be read ({why}). Restore or remove it.")
 
 
+def find_json(path: Path) -> dict[str, Any]:
+    """Returns the object in a file, or an empty one if there is none to read."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
 
 
-def append_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Appends rows to a log in one write; they are on the disk on return.
-
-    Args:
-      path: The log.
-      rows: Numbers may be Python's, NumPy's or jax's; NaN and infinity become null.
-    """
-    lines = [json.dumps(_plain(row), allow_nan=False) + "\n" for row in rows]
-    with storage_errors(f"write {path}"), path.open("ab", buffering=0) as file:
-        start = file.seek(0, os.SEEK_END)
-        try:
-            _write_all(file.fileno(), "".join(lines).encode())
-            os.fsync(file.fileno())
-        except OSError:
-            file.truncate(start)  # Half a row would spoil the next one.
-            raise
-
-
-def _write_all(file: int, data: bytes) -> None:
-    while data:
-        data = data[os.write(file, data) :]
-
-
-def log_size(path: Path) -> int:
-    """Returns the bytes in a log, for the meta of a checkpoint; 0 if there is none."""
-    return path.stat().st_size if path.exists() else 0
-
-
-def cut_log(path: Path, offset: int) -> None:
-    """Cuts a log back to what a checkpoint knows of.
-
-    The rest goes to `<path>.orphan`, after what is there.
-
-    Args:
-      path: The log; need not exist if `offset` is 0.
-      offset: `log_size` when the checkpoint was written.
-
-    Raises:
-      CheckpointError: The log is shorter than that.
-    """
-    size = log_size(path)
-    if size < offset:
-        raise CheckpointError(
-            f"{path} has {size} bytes, but its checkpoint knows of {offset}. Restore "
-            "the file or start over in another run directory."
-        )
-    if size == offset:
-        return
-    with storage_errors(f"cut {path}"), path.open("rb+") as file:
-        file.seek(offset)
-        rest = file.read()
-        with path.with_name(path.name + ".orphan").open("ab") as orphans:
-            orphans.write(rest if rest.endswith(b"\n") else rest + b"\n")
-            orphans.flush()
-            os.fsync(orphans.fileno())
-        file.truncate(offset)
-        os.fsync(file.fileno())
-
-
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Returns JSON values: arrays as lists, NaN and infinity as None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return _plain(np.asarray(value).tolist())
+        return plain(np.asarray(value).tolist())
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value

@@ -1,68 +1,51 @@
-"""The names in a checkpoint directory: which steps there are, and moves between names.
+"""A checkpoint directory: its names, and the seal over a step's files.
 
-A step's folder is called by its number. Other names start with a dot:
+A step's folder is called by its number. Every move is one rename, so a kill leaves the
+old name or the new one. Other names are left alone but for these:
 
-    .saving-7      a save that has not finished; removed by the next one
-    .deleted-7     an old step on its way out; removed by the next save
-    .corrupt-7     a step that failed its checks; kept for the user
-    .superseded-*  newer steps set aside by a resume from an older one; kept as well
+    7.orbax-checkpoint-tmp  a save that has not finished; removed by the next one
+    .deleted                old steps on their way out; removed by the next save
+    .corrupt-7              a step that failed its checks; kept for the user
 
-Every move is one rename, so a kill leaves the old name or the new one.
+The seal is the SHA-256 of every file, as `sha256sum -c` reads it: nothing parses a file
+of a checkpoint before its bytes are known to be those that were written.
 """
 
+import hashlib
 import itertools
 import os
 import shutil
+import stat
 import time
-from collections.abc import Collection
 from pathlib import Path
 
-from experiments.errors import CheckpointError
-from experiments.storage.checksums import SEAL
-from experiments.storage.disk import storage_errors, sync
+SEAL = "SHA256SUMS"
+DELETED = ".deleted"
+# The last two are names of older versions.
+_UNFINISHED = ("*.orbax-checkpoint-tmp", DELETED, ".saving-*", ".deleted-*")
+_MAX_FILES, _MAX_BYTES = 10_000, 100_000_000_000  # what a check may read
 
 
-def numbered(directory: Path) -> list[int]:
+def names(directory: Path) -> list[int]:
     """Returns every number that names anything in the directory, oldest first."""
-    if not directory.is_dir():
-        return []
-    names = [name for name in os.listdir(directory) if name.isascii()]
-    return sorted(int(n) for n in names if n.isdecimal() and n == str(int(n)))
+    found = os.listdir(directory) if directory.is_dir() else []
+    digits = [name for name in found if name.isascii() and name.isdecimal()]
+    return sorted(int(name) for name in digits if name == str(int(name)))
 
 
 def steps(directory: Path) -> list[int]:
     """Returns the steps that are complete, oldest first."""
-    directory = Path(directory)
-    return [n for n in numbered(directory) if _complete(directory / str(n))]
-
-
-def _complete(folder: Path) -> bool:
-    return not folder.is_symlink() and (folder / SEAL).is_file()
-
-
-def supersede(directory: Path, step: int) -> Path | None:
-    """Sets every step newer than `step` aside, so that a run can go on from there.
-
-    Returns:
-      The folder that now holds the others, or None if there were none.
-    """
-    directory = Path(directory).resolve()
-    newer = [number for number in numbered(directory) if number > step]
-    if not newer:
-        return None
-    with storage_errors(f"move newer checkpoints in {directory}"):
-        aside = _unused(directory / f".superseded-{time.strftime('%Y%m%d-%H%M%S')}")
-        aside.mkdir()
-        for number in reversed(newer):
-            (directory / str(number)).rename(aside / str(number))
-        sync(aside)
-        sync(directory)
-    return aside
+    folders = {number: Path(directory, str(number)) for number in names(directory)}
+    return [
+        n for n, x in folders.items() if (x / SEAL).is_file() and not x.is_symlink()
+    ]
 
 
 def quarantine(directory: Path, number: int) -> str:
     """Sets a damaged step aside and returns what became of it, for the warning."""
-    target = _unused(directory / f".corrupt-{number}")
+    target = directory / f".corrupt-{number}"
+    if os.path.lexists(target):
+        target = target.with_name(f"{target.name}.{time.time_ns()}")
     try:
         (directory / str(number)).rename(target)
     except OSError as error:  # Another user's run, say: it can be read, not changed.
@@ -70,41 +53,60 @@ def quarantine(directory: Path, number: int) -> str:
     return f"moved to {target.name}"
 
 
-def require_newest(directory: Path, step: int) -> None:
-    """Raises CheckpointError if there is a step as new as this one."""
-    newer = [number for number in numbered(directory) if number >= step]
-    if newer:
-        raise CheckpointError(
-            f"checkpoint {step} would not be the newest in {directory} "
-            f"(there: {', '.join(map(str, newer))}). Resume from the newest, or move "
-            "these away."
-        )
-
-
-def prune(directory: Path, keep: int, milestones: Collection[int]) -> None:
-    """Drops all but the newest `keep` steps and the milestones."""
-    kept = {*steps(directory)[-keep:], *milestones}
-    with storage_errors(f"delete an old checkpoint in {directory}"):
-        for number in numbered(directory):
-            if number not in kept:
-                gone = _unused(directory / f".deleted-{number}")
-                (directory / str(number)).rename(gone)
-    sweep(directory)
-
-
 def sweep(directory: Path) -> None:
     """Removes what did not finish; what cannot be removed waits for the next time."""
-    for pattern in (".saving-*", ".deleted-*"):
-        for path in directory.glob(pattern):
-            shutil.rmtree(path, ignore_errors=True)
+    for path in itertools.chain(*map(directory.glob, _UNFINISHED)):
+        shutil.rmtree(path, ignore_errors=True)
 
 
-def last_good(directory: Path, before: int) -> int | None:
-    """Returns the newest complete step older than `before`."""
-    return max((n for n in steps(directory) if n < before), default=None)
+def seal(folder: Path) -> None:
+    """Writes the seal of a finished folder into it."""
+    lines = [f"{checksum}  {name}\n" for name, checksum in _checksums(folder).items()]
+    (folder / SEAL).write_text("".join(lines))
 
 
-def _unused(path: Path) -> Path:
-    """Returns `path`, or `path.2`, `path.3`, ... if that exists."""
-    tries = (path.with_name(f"{path.name}.{i}") for i in itertools.count(2))
-    return next(p for p in itertools.chain([path], tries) if not os.path.lexists(p))
+def broken(folder: Path) -> str | None:
+    """Says what is wrong with a sealed folder, or returns None."""
+    if folder.is_symlink() or not (folder / SEAL).is_file():
+        return "incomplete"
+    try:
+        found = _checksums(folder)
+    except ValueError as error:
+        return str(error)
+    lines = (folder / SEAL).read_text(errors="replace").splitlines()
+    sealed = {
+        name: checksum for checksum, _, name in (x.partition("  ") for x in lines)
+    }
+    for name in sorted(sealed.keys() | found):
+        if name not in found or name not in sealed:
+            return (
+                f"{name} {'is missing' if name in sealed else 'does not belong there'}"
+            )
+        if found[name] != sealed[name]:
+            return f"checksum of {name}"
+    return None
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """Returns the SHA-256 of the files below a folder by name, but for the seal.
+
+    Raises:
+      ValueError: for a link, a device, or more than a checkpoint can hold.
+    """
+    found, count, size = {}, 0, 0
+    for parent, folders, files in os.walk(folder, onerror=_raise):
+        for path in (Path(parent, name) for name in (*folders, *files)):
+            name, status = path.relative_to(folder).as_posix(), path.lstat()
+            count, size = count + 1, size + status.st_size
+            if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+                raise ValueError(f"{name} is a link or a device")
+            if count > _MAX_FILES or size > _MAX_BYTES:
+                raise ValueError("too many or too large files")
+            if stat.S_ISREG(status.st_mode) and name != SEAL:
+                with path.open("rb") as file:
+                    found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
+def _raise(error: OSError) -> None:
+    raise error

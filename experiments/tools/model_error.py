@@ -32,8 +32,9 @@ from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
 from experiments.presets import PRESETS
-from experiments.report import logs, tables
-from experiments.storage import checkpoint, rundir
+from experiments.report import tables
+from experiments.storage import metrics, rundir
+from experiments.storage.folder import RunFolder
 from jaxpets.envs import half_cheetah
 
 # `Ensemble.predict`.
@@ -66,10 +67,7 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     """
     if num_rows < 1:
         raise UsageError(f"--rows {num_rows} is not valid; it must be 1 or more.")
-    configs = [
-        from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
-        for run in runs
-    ]
+    configs = [from_json(RunFolder(run).config(), PRESETS["smoke"]) for run in runs]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
     # The random trials of a seed are the same in all arms: all models know them.
@@ -95,7 +93,7 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
 
 
 def _label(config: Config) -> str:
-    return logs.label(config.arm, to_json(config))
+    return metrics.arm_label(config.arm, to_json(config))
 
 
 def _check_comparable(
@@ -123,12 +121,14 @@ def _read(
     parts = build(config)
     whole = phases.explored_template(config, parts)
     template = phases.model_of(whole)._replace(dataset=whole.dataset)
-    found = checkpoint.restore(
-        run / "checkpoints", template, step=at_trial, part=True, warn=print
-    )
+    folder = RunFolder(run)
+    if at_trial is None:
+        found = folder.restore(template, part=True)
+    else:
+        found = at_trial, folder.restore_trial(at_trial, template, part=True)
     if found is None:
         raise UsageError(f"there is no checkpoint in {run}.")
-    trial, state, _ = found
+    trial, state = found
     size = int(state.dataset.size)
     if size - first < num_rows:
         raise UsageError(

@@ -9,7 +9,6 @@ run's own back.
 
 import argparse
 import dataclasses
-import json
 import shutil
 import sys
 from collections.abc import Sequence
@@ -23,8 +22,8 @@ from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
 from experiments.presets import PRESETS, PRETRAINED_PLANNER
-from experiments.report import logs
-from experiments.storage import checkpoint, rundir
+from experiments.storage import metrics, rundir
+from experiments.storage.folder import RunFolder
 
 
 def ship(run: Path, name: str, seed: int | None = None) -> Path:
@@ -43,12 +42,13 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     folder = cli.PRETRAINED / name
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
-    config = from_json(rundir.read_json(run / "config.json"), PRESETS["smoke"])
+    plain = RunFolder(run).config()
+    config = from_json(plain, PRESETS["smoke"])
     seed = config.seeds[0] if seed is None else seed
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
         raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
-    performed, step, state = _performed(run, config)
+    evaluated, step, state = _evaluated(run, config)
     i = config.seeds.index(seed)
     state = jax.tree.map(lambda x: x[i : i + 1], state)
     shipped = dataclasses.replace(
@@ -59,42 +59,38 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
         refit=dataclasses.replace(config.refit, num_epochs=0),  # as it performed
         task_planner=PRETRAINED_PLANNER,
     )
-    checkpoint.save(folder / "checkpoints", step, state, {}, finite=state)
-    rundir.write_json(folder / "config.json", to_json(shipped))
-    shutil.copyfile(run / "env.json", folder / "env.json")
-    for file in ("config.json", "env.json"):  # how the model came to be what it is
-        shutil.copyfile(performed / file, folder / f"performed-{file}")
-    rows = (run / "metrics.jsonl").read_text().splitlines()
-    rundir.append_rows(
-        folder / "metrics.jsonl",
-        [row for row in map(json.loads, rows) if row["seed"] == seed],
-    )
+    model = RunFolder(folder)
+    model.save(step, state)
+    model.write_json(rundir.CONFIG, to_json(shipped))
+    shutil.copyfile(run / rundir.ENVIRONMENT, folder / rundir.ENVIRONMENT)
+    for file in (rundir.CONFIG, rundir.ENVIRONMENT):  # how it came to be what it is
+        shutil.copyfile(evaluated.path / file, folder / f"performed-{file}")
+    rows = metrics.read(run / rundir.METRICS, plain)
+    model.log([row.data for row in rows if row.seed == seed])
     return folder
 
 
-def _performed(run: Path, config: Config) -> tuple[Path, int, phases.State]:
+def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, phases.State]:
     """Returns the folder of the last zero-shot, its trial, and the model `[S]` of it.
 
     That of all tasks and without a tag, if there is one.
     """
-    folders = run.glob("zero-shot-*")
-    performed = [
-        folder for folder in folders if checkpoint.steps(folder / "checkpoints")
-    ]
-    if not performed:
+    folders = map(RunFolder, run.glob("zero-shot-*"))
+    evaluated = [folder for folder in folders if folder.steps()]
+    if not evaluated:
         raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
-    last = max(performed, key=_rank)
+    last = max(evaluated, key=_rank)
     template = phases.model_of(phases.explored_template(config, build(config)))
-    found = checkpoint.restore(last / "checkpoints", template, warn=print)
+    found = last.restore(template)
     assert found is not None
-    return last, *found[:2]
+    return last, *found
 
 
-def _rank(folder: Path) -> tuple[int, bool, bool, str]:
+def _rank(folder: RunFolder) -> tuple[int, bool, bool, str]:
     """Orders zero-shots: by trials explored, without a tag, of all tasks."""
-    config = logs.read_json(folder / "config.json")
-    step = checkpoint.steps(folder / "checkpoints")[-1]
-    return step, not config.get("tag"), config.get("task") == "all", folder.name
+    config = rundir.find_json(folder.path / rundir.CONFIG)
+    every = config.get("task") == "all"
+    return folder.steps()[-1], not config.get("tag"), every, folder.path.name
 
 
 def main(argv: Sequence[str] | None = None) -> int:

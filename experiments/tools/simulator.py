@@ -20,7 +20,8 @@ from experiments import acting
 from experiments.build import ENGINES, optimizer
 from experiments.config import EngineName, PlannerConfig
 from experiments.presets import PRETRAINED_PLANNER
-from experiments.storage import rundir
+from experiments.storage import metrics, rundir
+from experiments.storage.environment import environment
 from jaxpets.envs import env_rollout, half_cheetah
 
 
@@ -73,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Performs, and prints a line per task."""
     args = tyro.cli(Arguments, args=argv, prog="experiments.tools.simulator")
     begin = time.monotonic()
-    where = {"date": rundir.now(), "env": rundir.environment()}
+    where = {"date": rundir.now(), "env": environment()}
     returns = perform(args)
     for name, own in zip(half_cheetah.TASK_NAMES, returns, strict=True):
         each = " ".join(f"{value:.0f}" for value in own)
@@ -92,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             for i, value in enumerate(own.tolist())
         ]
         if args.json:
-            rundir.append_rows(args.json, rows)
+            metrics.append_rows(args.json, rows)
     print(f"{time.monotonic() - begin:.0f} s", file=sys.stderr)
 
 

@@ -11,8 +11,8 @@ import pytest
 from states import as_bytes, fail, make_state, restore, save_two
 
 from experiments.errors import CheckpointError, DivergedError
-from experiments.storage import checkpoint, manifest
-from experiments.storage.checksums import SEAL
+from experiments.storage import checkpoint
+from experiments.storage.step_folders import SEAL
 
 
 @pytest.fixture
@@ -104,13 +104,11 @@ def test_keep_and_milestones(tmp_path):
 def test_going_on_from_an_older_step(directory):
     with pytest.raises(CheckpointError, match=r"checkpoint 2 would not be the newest"):
         checkpoint.save(directory, 2, make_state(5), {"log": 5})
-    aside = checkpoint.supersede(directory, 1)
-    assert aside is not None
-    assert os.listdir(aside) == ["2"]
-    assert checkpoint.supersede(directory, 1) is None
+    (directory / "2").rename(directory / ".moved-2")  # as the message says
     checkpoint.save(directory, 2, make_state(5), {"log": 5})
     found, _ = restore(directory)
     assert as_bytes(found[1]) == as_bytes(make_state(5))
+    assert sorted(os.listdir(directory)) == [".moved-2", "1", "2"]
 
 
 def test_non_finite_parts_are_refused(directory):
@@ -170,9 +168,9 @@ def test_leaves_that_do_not_fit(directory, altered, message):
 
 def test_a_newer_schema(directory, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(manifest, "SCHEMA", 2)
+        patch.setattr(checkpoint, "SCHEMA", 3)
         checkpoint.save(directory, 3, make_state(3), {})
-    with pytest.raises(CheckpointError, match=r"schema 2; this is jaxpets .*schema 1"):
+    with pytest.raises(CheckpointError, match=r"schema 3; this is jaxpets .*schema 2"):
         restore(directory)
 
 

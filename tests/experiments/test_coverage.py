@@ -10,6 +10,7 @@ import runs
 
 from experiments.report import coverage
 from experiments.run import main
+from experiments.storage.folder import RunFolder
 from jaxpets.envs import half_cheetah
 
 SHAPE = len(coverage.VELOCITY_EDGES) - 1, len(coverage.PITCH_RATE_EDGES) - 1
@@ -145,9 +146,7 @@ def test_only_rows_that_are_filled_count(explored, tmp_path):
     (tmp_path / "checkpoints").symlink_to(explored / "checkpoints")
     whole = runs.learner(explored, step=runs.LAST - 1)
     template = jax.tree.map(lambda _: None, whole)._replace(dataset=whole.dataset)
-    coverage.write(
-        tmp_path, SEEDS, template, runs.LAST - 1, anew=False, warn=pytest.fail
-    )
+    coverage.write(RunFolder(tmp_path), SEEDS, template, runs.LAST - 1, anew=False)
     counts = json.loads((tmp_path / "coverage.json").read_text())["counts"]
     assert [np.sum(x) for x in counts.values()] == [(runs.LAST - 1) * runs.STEPS] * 2
 

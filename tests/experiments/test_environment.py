@@ -12,12 +12,13 @@ import pytest
 
 from experiments.errors import CheckpointError
 from experiments.storage import rundir
+from experiments.storage.environment import compare_environment, environment
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_environment_is_json_and_complete(tmp_path):
-    now = rundir.environment()
+    now = environment()
     rundir.write_json(tmp_path / "env.json", now)
     assert rundir.read_json(tmp_path / "env.json") == now
     assert now["jax"] == jax.__version__
@@ -32,23 +33,23 @@ def test_environment_is_json_and_complete(tmp_path):
 
 
 def test_differences_between_environments():
-    now = rundir.environment()
-    assert rundir.compare_environment(now, now) == []
+    now = environment()
+    assert compare_environment(now, now) == []
     old = {**now, "jax": "0.10.0", "xla_flags": "--xla_x", "gone": 1}
     del old["numpy"]
-    lines = rundir.compare_environment(old, now)
+    lines = compare_environment(old, now)
     assert lines == [
         f"jax was 0.10.0 and is now {now['jax']}",
         f"xla_flags was --xla_x and is now {now['xla_flags']}",
     ]
     for changed in ({"x64": not now["x64"]}, {"prng_impl": "rbg"}):
         with pytest.raises(CheckpointError, match=f"{next(iter(changed))} was"):
-            rundir.compare_environment({**now, **changed}, now)
+            compare_environment({**now, **changed}, now)
 
 
 def test_flags_of_another_process_are_seen():
-    script = "import json; from experiments.storage import rundir; "
-    script += "print(json.dumps(rundir.environment()))"
+    script = "import json; from experiments.storage.environment import environment; "
+    script += "print(json.dumps(environment()))"
     flags = {"JAX_ENABLE_X64": "1", "JAX_THREEFRY_PARTITIONABLE": "0"}
     done = subprocess.run(
         [sys.executable, "-c", script],
@@ -61,4 +62,4 @@ def test_flags_of_another_process_are_seen():
     other = json.loads(done.stdout)
     assert (other["x64"], other["threefry_partitionable"]) == (True, False)
     with pytest.raises(CheckpointError, match="x64 was False and is now True"):
-        rundir.compare_environment(rundir.environment(), other)
+        compare_environment(environment(), other)

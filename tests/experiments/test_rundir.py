@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from experiments.errors import CheckpointError, StorageError, UsageError
-from experiments.storage import rundir
+from experiments.storage import metrics, rundir
 
 ROOT = Path(__file__).parents[2]
 
@@ -211,7 +211,7 @@ def test_rows_are_valid_json(tmp_path):
         "done": np.bool_(True),
         "note": None,
     }
-    rundir.append_rows(path, [row, {"trial": 4}])
+    metrics.append_rows(path, [row, {"trial": 4}])
     assert rows_of(path) == [
         {
             "trial": 3,
@@ -224,24 +224,24 @@ def test_rows_are_valid_json(tmp_path):
         },
         {"trial": 4},
     ]
-    rundir.append_rows(path, [])
+    metrics.append_rows(path, [])
     assert len(rows_of(path)) == 2
 
 
 def test_a_torn_log_has_each_trial_once_after_a_resume(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    rundir.cut_log(path, 0)
-    assert rundir.log_size(path) == 0
-    rundir.append_rows(path, [{"trial": 1}, {"trial": 2}])
-    offset = rundir.log_size(path)
-    rundir.append_rows(path, [{"trial": 3}, {"trial": 4}])
+    metrics.cut_log(path, 0)
+    assert metrics.log_size(path) == 0
+    metrics.append_rows(path, [{"trial": 1}, {"trial": 2}])
+    offset = metrics.log_size(path)
+    metrics.append_rows(path, [{"trial": 3}, {"trial": 4}])
     with path.open("a") as file:
         file.write('{"trial": 5, "ret')
-    rundir.cut_log(path, offset)
-    rundir.cut_log(path, offset)
-    rundir.append_rows(path, [{"trial": 3}])
+    metrics.cut_log(path, offset)
+    metrics.cut_log(path, offset)
+    metrics.append_rows(path, [{"trial": 3}])
     assert rows_of(path) == [{"trial": 1}, {"trial": 2}, {"trial": 3}]
-    rundir.cut_log(path, offset)
+    metrics.cut_log(path, offset)
     orphans = (tmp_path / "metrics.jsonl.orphan").read_text().splitlines()
     assert orphans == [
         '{"trial": 3}',
@@ -253,14 +253,14 @@ def test_a_torn_log_has_each_trial_once_after_a_resume(tmp_path):
 
 def test_a_log_that_lost_rows(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    rundir.append_rows(path, [{"trial": 1}])
+    metrics.append_rows(path, [{"trial": 1}])
     with pytest.raises(CheckpointError, match=r"has 13 bytes, but .* knows of 99"):
-        rundir.cut_log(path, 99)
+        metrics.cut_log(path, 99)
 
 
 def test_a_full_disk_leaves_no_half_row(tmp_path, monkeypatch):
     path = tmp_path / "metrics.jsonl"
-    rundir.append_rows(path, [{"trial": 1}])
+    metrics.append_rows(path, [{"trial": 1}])
     real, calls = os.write, []
 
     def half(file: int, data: bytes) -> int:
@@ -272,7 +272,7 @@ def test_a_full_disk_leaves_no_half_row(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", half)
         with pytest.raises(StorageError, match="No space left"):
-            rundir.append_rows(path, [{"trial": 2}])
+            metrics.append_rows(path, [{"trial": 2}])
     assert len(calls) == 2
-    rundir.append_rows(path, [{"trial": 3}])
+    metrics.append_rows(path, [{"trial": 3}])
     assert rows_of(path) == [{"trial": 1}, {"trial": 3}]

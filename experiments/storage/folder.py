@@ -1,0 +1,241 @@
+"""A run's folder and who writes to it: the one owner of its files.
+
+Every process of a run may call what is here: process 0 has the folder, and what it
+reads or fails at gets to the others.
+"""
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.errors import CheckpointError, InterruptedRun, RunError
+from experiments.parallel import distributed
+from experiments.storage import checkpoint, metrics, pytrees, rundir
+from experiments.storage.environment import compare_environment, environment
+
+# What differs between the config that a folder was started with and one of now.
+Differences = Callable[[dict[str, Any]], list[str]]
+
+
+class RunFolder(NamedTuple):
+    """The folder of a run; `open_run` gives one to write to, any path one to read."""
+
+    path: Path
+    milestones: Sequence[int] = ()  # trials whose checkpoints are never dropped
+
+    def say(self, text: str) -> None:
+        """Prints a line for the user."""
+        distributed.say(text)
+
+    # Reading.
+
+    def config(self) -> dict[str, Any]:
+        """Returns the config that the run was started with, in JSON."""
+        return distributed.on_first(lambda: rundir.read_json(self.path / rundir.CONFIG))
+
+    def steps(self) -> list[int]:
+        """Returns the trials that have a checkpoint, oldest first."""
+        return distributed.on_first(lambda: checkpoint.steps(self._checkpoints))
+
+    def has(self, name: str) -> bool:
+        """Returns whether there is a file of this name with something in it."""
+        return distributed.on_first(lambda: metrics.log_size(self.path / name) > 0)
+
+    def has_log(self) -> bool:
+        """Returns whether a row was logged."""
+        return self.has(rundir.METRICS)
+
+    def restore(self, template: Any, *, part: bool = False) -> tuple[int, Any] | None:
+        """Returns trial and state of the last checkpoint, None before the first.
+
+        Args:
+          template: as in `checkpoint.restore`.
+          part: whether the template may be a part of what was saved.
+        """
+        found = self._restore(template, None, part)
+        return found[:2] if found else None
+
+    def restore_trial(self, trial: int, template: Any, *, part: bool = False) -> Any:
+        """Returns the state after a trial.
+
+        Raises:
+          CheckpointError: if it was not kept.
+        """
+        found = self._restore(template, trial, part)
+        assert found is not None  # a trial that is asked for and not there is an error
+        return found[1]
+
+    def resume(self, template: Any) -> tuple[int, Any] | None:
+        """Returns what `restore` does, and cuts off what was logged after it."""
+        found = self._restore(template, None, False)
+        size = found[2]["log"] if found else 0
+        distributed.on_first(lambda: metrics.cut_log(self._log, size))
+        return found[:2] if found else None
+
+    # Writing.
+
+    def record(
+        self, trial: int, rows: Sequence[Mapping[str, Any]], state: Any, finite: Any
+    ) -> None:
+        """Logs a trial and saves what was learned; it is on the disk on return.
+
+        Args:
+          trial: newer than all before.
+          rows: of the log.
+          state: what to go on from.
+          finite: the part of it whose floats must be finite.
+        """
+
+        def write() -> None:
+            metrics.append_rows(self._log, rows)
+            self._save(trial, state, {"log": metrics.log_size(self._log)}, finite)
+
+        distributed.on_first(write)
+
+    def save(self, step: int, state: Any) -> None:
+        """Saves a state whose floats must be finite."""
+        distributed.on_first(lambda: self._save(step, state, {}, state))
+
+    def log(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Appends rows to the log."""
+        distributed.on_first(lambda: metrics.append_rows(self._log, rows))
+
+    def save_trajectories(self, **arrays: np.ndarray) -> None:
+        """Writes what a video is made of."""
+        distributed.on_first(lambda: self._save_trajectories(arrays))
+
+    def write_json(self, name: str, data: Any) -> None:
+        """Replaces a JSON file."""
+        distributed.on_first(lambda: rundir.write_json(self.path / name, data))
+
+    @property
+    def trajectories(self) -> Path:
+        """The file of `save_trajectories`."""
+        return self.path / rundir.TRAJECTORIES
+
+    # On process 0, but for `_restore`.
+
+    @property
+    def _checkpoints(self) -> Path:
+        return self.path / rundir.CHECKPOINTS
+
+    @property
+    def _log(self) -> Path:
+        return self.path / rundir.METRICS
+
+    def _restore(
+        self, template: Any, step: int | None, part: bool
+    ) -> tuple[int, Any, dict[str, Any]] | None:
+        kept = []
+
+        def read() -> tuple[int, dict[str, Any]] | None:
+            found = checkpoint.restore(
+                self._checkpoints, template, step=step, part=part,
+                warn=lambda line: self.say(f"warning: {line}"),
+            )  # fmt: skip
+            if found is None:
+                return None
+            kept.append(found[1])
+            return found[0], found[2]
+
+        found = distributed.on_first(read)
+        if found is None:
+            return None
+        number, meta = found
+        return number, _shared(kept[0] if kept else None, template), meta
+
+    def _save(self, step: int, state: Any, meta: dict[str, Any], finite: Any) -> None:
+        checkpoint.save(
+            self._checkpoints, step, state, meta,
+            finite=finite, milestones=self.milestones,
+        )  # fmt: skip
+
+    def _save_trajectories(self, arrays: Mapping[str, Any]) -> None:
+        data = io.BytesIO()
+        np.savez_compressed(data, **arrays)
+        rundir.replace_file(self.trajectories, data.getvalue())
+
+
+@contextlib.contextmanager
+def open_run(
+    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
+) -> Iterator[RunFolder]:
+    """Holds a run's folder for as long as the run lasts: locked, and accounted for.
+
+    Args:
+      path: made if it is not there.
+      config: in JSON; kept beside what comes of it.
+      differences: says what may not differ between that of the start and this one.
+      needed_bytes: how much must be free there.
+
+    Raises:
+      CheckpointError: if the folder is in use or belongs to another config.
+      StorageError: if it cannot be written to.
+    """
+    run = RunFolder(path, tuple(config["milestones"]))
+    held = _held(path, config, differences, needed_bytes)
+    with distributed.held_by_first(held):
+        yield run
+
+
+@contextlib.contextmanager
+def _held(
+    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
+) -> Iterator[None]:
+    rundir.probe(path, needed_bytes)
+    with rundir.lock(path):
+        _describe(path, config, differences)
+        _status(path, "running")
+        try:
+            yield
+        except InterruptedRun as error:
+            _status(path, "interrupted", str(error))
+            raise InterruptedRun(
+                f"{error}; at most the trial under way is lost. Continue with the same "
+                "command."
+            ) from error
+        except RunError as error:
+            _status(path, "failed", str(error))
+            raise
+        _status(path, "complete")
+
+
+def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
+    """Writes config and environment of a new run, compares those of an old one."""
+    if not (path / rundir.CONFIG).exists():
+        rundir.write_json(path / rundir.CONFIG, config)
+    elif lines := differences(rundir.read_json(path / rundir.CONFIG)):
+        another = "--name" if config["phase"] == "explore" else "--tag"
+        raise CheckpointError(
+            f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "
+            f"flags, or another {another}."
+        )
+    if not (path / rundir.ENVIRONMENT).exists():
+        rundir.write_json(path / rundir.ENVIRONMENT, environment())
+        return
+    old = rundir.read_json(path / rundir.ENVIRONMENT)
+    for line in compare_environment(old, environment()):
+        distributed.say(f"warning: {line}")
+
+
+def _status(path: Path, state: str, reason: str = "") -> None:
+    status = {"state": state, "reason": reason, "time": rundir.now()}
+    rundir.write_json(path / rundir.STATUS, status)
+
+
+def _shared(state: Any, template: Any) -> Any:
+    """Gives every process the state that process 0 has read."""
+    if distributed.is_alone():
+        return state
+    arrays = {
+        name: np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"]))
+        for name, leaf in pytrees.describe(template).items()
+    }
+    if state is not None:
+        arrays = pytrees.to_host(state)
+    return pytrees.from_host(distributed.share(arrays), template)

@@ -1,0 +1,124 @@
+"""A run's folder: what is recorded comes back, and what becomes of a run is written."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.errors import CheckpointError, InterruptedRun, StorageError
+from experiments.storage import folder, rundir
+from experiments.storage.folder import RunFolder
+
+CONFIG = {"phase": "explore", "milestones": [1], "seeds": [0]}
+
+
+def state(trial):
+    return {"w": jnp.full((3,), trial, jnp.float32)}
+
+
+def record(run, trial):
+    run.record(trial, [{"trial": trial}], state(trial), finite=state(trial))
+
+
+def trials(run):
+    lines = (run.path / rundir.METRICS).read_text().splitlines()
+    return [json.loads(line)["trial"] for line in lines]
+
+
+def differences(old):
+    return [f"seeds: {old['seeds']}"] if old["seeds"] != CONFIG["seeds"] else []
+
+
+def opened(path, config=CONFIG):
+    return folder.open_run(path, config, differences, 1000)
+
+
+def status(path):
+    return json.loads((path / rundir.STATUS).read_text())
+
+
+def test_a_run_goes_on_from_what_it_recorded(tmp_path):
+    run = RunFolder(tmp_path, milestones=(1,))
+    assert run.resume(state(0)) is None and run.restore(state(0)) is None
+    assert not run.has_log() and run.steps() == []
+    for trial in (1, 2, 3, 4):
+        record(run, trial)
+    run.log([{"trial": 5}])  # it was stopped before its checkpoint
+    trial, found = run.resume(state(0))
+    assert trial == 4 and found["w"].tolist() == [4.0] * 3
+    assert trials(run) == [1, 2, 3, 4] and run.has_log()
+    assert run.steps() == [1, 3, 4]  # a milestone and the last two
+    assert run.restore_trial(1, state(0))["w"].tolist() == [1.0] * 3
+    with pytest.raises(CheckpointError, match=r"no checkpoint 2 in .*there: 1, 3, 4"):
+        run.restore_trial(2, state(0))
+
+
+def test_a_part_of_a_state_can_be_read(tmp_path):
+    run = RunFolder(tmp_path)
+    run.save(7, {**state(7), "more": jnp.zeros(2)})
+    assert run.restore_trial(7, state(0), part=True)["w"].tolist() == [7.0] * 3
+    with pytest.raises(CheckpointError, match="more is not in this run"):
+        run.restore(state(0))
+
+
+def test_trajectories_are_replaced_at_once(tmp_path, monkeypatch):
+    run = RunFolder(tmp_path)
+    run.save_trajectories(obs=np.arange(3))
+
+    def full(_file):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rundir.os, "fsync", full)
+        with pytest.raises(StorageError, match="No space left"):
+            run.save_trajectories(obs=np.arange(4))
+    assert np.load(run.trajectories)["obs"].tolist() == [0, 1, 2]
+    assert [path.name for path in tmp_path.iterdir()] == [rundir.TRAJECTORIES]
+
+
+def test_what_becomes_of_a_run_is_written(tmp_path):
+    with opened(tmp_path) as run:
+        assert run.path == tmp_path and run.milestones == (1,)
+        assert run.config() == CONFIG
+        assert status(tmp_path)["state"] == "running"
+        with pytest.raises(CheckpointError, match="in use by pid"), opened(tmp_path):
+            raise AssertionError("two hold it")
+    assert status(tmp_path)["state"] == "complete"
+    with pytest.raises(InterruptedRun, match=r"SIGTERM; .* command"):  # noqa: SIM117
+        with opened(tmp_path):
+            raise InterruptedRun("SIGTERM")
+    assert status(tmp_path) | {"time": ""} == {
+        "state": "interrupted", "reason": "SIGTERM", "time": "",
+    }  # fmt: skip
+    with pytest.raises(StorageError), opened(tmp_path):
+        raise StorageError("the disk is full")
+    assert status(tmp_path)["reason"] == "the disk is full"
+
+
+@pytest.mark.parametrize(
+    ("phase", "flag"), [("explore", "--name"), ("zero-shot", "--tag")]
+)
+def test_a_folder_belongs_to_one_config(tmp_path, phase, flag):
+    with opened(tmp_path, CONFIG | {"seeds": [1]}):
+        pass
+    config = CONFIG | {"phase": phase}
+    with pytest.raises(CheckpointError) as error, opened(tmp_path, config):
+        raise AssertionError("it is another's")
+    assert str(error.value) == (
+        f"{tmp_path} was started with other numbers: seeds: [1]. Use the same flags, "
+        f"or another {flag}."
+    )
+    assert RunFolder(tmp_path).config()["seeds"] == [1]
+
+
+def test_another_environment_is_said(tmp_path, capsys):
+    with opened(tmp_path):
+        pass
+    path = tmp_path / rundir.ENVIRONMENT
+    rundir.write_json(path, rundir.read_json(path) | {"numpy": "0.1"})
+    with opened(tmp_path):
+        pass
+    err = capsys.readouterr().err
+    assert err.startswith("warning: numpy was 0.1 and is now ")
+    assert err.count("\n") == 1
