@@ -187,7 +187,7 @@ ROOMS = {
     "errors": set(),
     "parallel": {"errors"},
     "storage": {"errors", "parallel"},
-    "report": {"errors", "storage"},
+    "report": {"errors", "storage", "config", "entries"},
 }
 # digests reads what any version wrote, without the code of any.
 ORBAX = {"storage.checkpoint", "tools.digests"}

@@ -154,6 +154,5 @@ def check_keys(name: str, keys: Any, count: int) -> None:
 def _check_typed(name: str, key: Any, wanted: str) -> None:
     dtype = getattr(key, "dtype", None)
     if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
-        raise TypeError(
-            f"{name} must be {wanted} from jax.random.key, got {dtype or key!r}."
-        )
+        got = repr(key) if dtype is None else str(dtype)
+        raise TypeError(f"{name} must be {wanted} from jax.random.key, got {got}.")

@@ -39,7 +39,8 @@ class Ensemble(NamedTuple):
       predict: `(params, obs [E, B, D], action [B, A]) -> (mean, variance)`, both
         `[E, B, D]`, of the next observation.
       sample: a DynamicsFn; draws from `predict` and bounds the result.
-      fit_scaler: `(data: Transition [C, ...], size []) -> scaler` over the first rows.
+      fit_scaler: `(data: Transition [C, ...], size []) -> scaler` over the first rows,
+        with the structure and shapes of the one of `init`.
       encode: `(scaler, data: Transition) -> (inputs [..., F+A], targets [..., D])`.
       loss: `(network, inputs [E, B, F+A], targets [E, B, D], weight [B]) -> (loss,
         (nll, mse))`, all `[]`; `weight` sums to one, `nll` is the loss without its

@@ -146,8 +146,7 @@ def fitter(
       A Fitter.
 
     Raises:
-      TypeError: if an argument is not what it should be; from the functions, when
-        traced, TypeError or ValueError.
+      TypeError, ValueError: if an argument is not what it should be.
     """
     check_record("ensemble", ensemble, Ensemble)
     check_record("config", config, FitConfig)
