@@ -103,7 +103,7 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     with (
         _without_gl(),
         stoppable(),
-        folder.open_run(path, plain, lambda old: differences(old, plain), size) as run,
+        folder.open_run(path, plain, differences, size) as run,
     ):
         yield run
 

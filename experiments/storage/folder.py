@@ -18,8 +18,8 @@ from experiments.parallel import distributed
 from experiments.storage import checkpoint, metrics, pytrees, rundir
 from experiments.storage.environment import compare_environment, environment
 
-# What differs between the config that a folder was started with and one of now.
-Differences = Callable[[dict[str, Any]], list[str]]
+# (of the start, of now) -> what differs between two configs in JSON.
+Differences = Callable[[Any, Any], list[str]]
 
 
 class RunFolder(NamedTuple):
@@ -170,7 +170,7 @@ def open_run(
     Args:
       path: made if it is not there.
       config: in JSON; kept beside what comes of it.
-      differences: says what may not differ between that of the start and this one.
+      differences: says what of two configs differs and may not.
       needed_bytes: how much must be free there.
 
     Raises:
@@ -209,7 +209,7 @@ def _describe(path: Path, config: dict[str, Any], differences: Differences) -> N
     """Writes config and environment of a new run, compares those of an old one."""
     if not (path / rundir.CONFIG).exists():
         rundir.write_json(path / rundir.CONFIG, config)
-    elif lines := differences(rundir.read_json(path / rundir.CONFIG)):
+    elif lines := differences(rundir.read_json(path / rundir.CONFIG), config):
         another = "--name" if config["phase"] == "explore" else "--tag"
         raise CheckpointError(
             f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "

@@ -26,8 +26,8 @@ def trials(run):
     return [json.loads(line)["trial"] for line in lines]
 
 
-def differences(old):
-    return [f"seeds: {old['seeds']}"] if old["seeds"] != CONFIG["seeds"] else []
+def differences(old, new):
+    return [f"seeds: {old['seeds']}"] if old["seeds"] != new["seeds"] else []
 
 
 def opened(path, config=CONFIG):
