@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 from experiments.config import NUM_TASKS, Config, PlannerConfig
 from experiments.errors import UsageError
-from jaxpets.envs import half_cheetah
 
 # Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
 _CPU_FLOPS_AN_HOUR = 1e11 * 3600
@@ -16,6 +15,8 @@ def model_flops(hidden_sizes: Sequence[int]) -> float:
 
     Only the network's matrix products are counted.
     """
+    from jaxpets.envs import half_cheetah  # brings mujoco, which flags need not
+
     widths = (
         half_cheetah.OBS_SIZE + half_cheetah.ACTION_SIZE,  # pitch as sine and cosine,
         *hidden_sizes,  # but no finite-difference velocity

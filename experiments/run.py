@@ -64,7 +64,8 @@ def _dispatch(config: Config) -> None:
     from experiments.storage.folder import RunFolder
 
     source = RunFolder(cli.explored_run(config))
-    check_cpu(config)
+    with _without_gl():
+        check_cpu(config)
     if config.phase == "explore":
         with _opened(config, source.path) as run:
             from experiments import phases

@@ -66,7 +66,7 @@ MODULES_OF_NAMES = [
     jaxpets.typing,
 ]
 
-# Where third parties may be imported; jax and chex anywhere.
+# Where third parties may be imported; jax anywhere.
 HOMES = {
     "flax": {"_src.network"},
     "optax": {"_src.fitter"},

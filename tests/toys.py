@@ -3,6 +3,7 @@
 import functools
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -158,11 +159,9 @@ def dataset_of(data, capacity=40):
 
 
 def assert_trees_close(got, want, **tolerance):
-    """Equal structure, avals and (nearly) values."""
-    assert jax.tree.structure(got) == jax.tree.structure(want)
-    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
-        assert a.dtype == b.dtype and a.shape == b.shape
-        np.testing.assert_allclose(np.asarray(a), np.asarray(b), **tolerance)
+    """Equal structure, shapes, dtypes and (nearly) values."""
+    chex.assert_trees_all_equal_shapes_and_dtypes(got, want)
+    chex.assert_trees_all_close(got, want, **{"rtol": 1e-7, "atol": 0.0} | tolerance)
 
 
 def avals(tree):

@@ -100,14 +100,7 @@ def _write(
     explored = _explored(rows)
     found = scores(rows, explored)
     _write_json(files.table_1, found)
-    figures.figure_4(files.figure_4, _panels(rows, found, explored), explored)
-    # Random actions are of no value to anyone, whatever a log says.
-    planned = [r for r in rows if "random" not in (r.arm, r.data.get("planner"))]
-    figures.exploration(
-        files.exploration,
-        _curves(exploring(planned, "value")),
-        _curves(exploring(rows, "turns")),
-    )
+    _draw(rows, found, explored, files)
     lines = [
         f"# Report of preset `{rows[0].preset}`",
         "",
@@ -135,6 +128,16 @@ def _write(
         *_runs(every, out),
     ]
     files.report.write_text("\n".join(lines))
+
+
+def _draw(rows: Sequence[Row], found: Scores, explored: int, files: _Files) -> None:
+    """Draws Figure 4 and what exploration was like."""
+    figures.figure_4(files.figure_4, _panels(rows, found, explored), explored)
+    # Random actions are of no value to anyone, whatever a log says.
+    planned = [r for r in rows if "random" not in (r.arm, r.data.get("planner"))]
+    value = _curves(exploring(planned, "value"))
+    turns = _curves(exploring(rows, "turns"))
+    figures.exploration(files.exploration, value, turns)
 
 
 def _explored(rows: Sequence[Row]) -> int:

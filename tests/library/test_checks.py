@@ -155,3 +155,9 @@ def test_key_refuses_a_batch():
     keys = jax.random.split(jax.random.key(0), 3)
     with pytest.raises(ValueError, match=r"key must be a single key.*\(3,\).*vmap"):
         checks.check_key("key", keys)
+
+
+@pytest.mark.parametrize("values", [0.5, "much", None])
+def test_reals_take_a_sequence(values):
+    with pytest.raises(TypeError, match=r"rates must be a tuple of floats, got"):
+        checks.check_reals("rates", values, 0.0)

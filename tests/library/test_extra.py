@@ -32,8 +32,9 @@ def test_a_missing_simulator_names_the_extra(without, monkeypatch, module):
     assert "mujoco" in str(caught.value)
 
 
-def test_missing_mjx_names_the_extra(without):
+def test_missing_mjx_names_the_extra(without, monkeypatch):
     without("mujoco.mjx")
+    monkeypatch.delattr("mujoco.mjx", raising=False)  # as long as it was not imported
     with pytest.raises(ImportError, match=MESSAGE):
         hc.half_cheetah()
 
