@@ -87,11 +87,10 @@ def run(
     return trials
 
 
-def over_branches(placement: Placement, learn: Learn, *axes: str) -> Learn:
+def over_branches(placement: Placement, learner: jaxpets.Learner, *axes: str) -> Learn:
     """Returns `learn` over `axes`, jitted, with its share of them on every device."""
-    mapped = jaxpets.Learner(_never, learn, _never)
     for axis in reversed(axes):
-        mapped = jaxpets.over_seeds(mapped, devices.each(placement, axis))
+        learner = jaxpets.over_seeds(learner, devices.each(placement, axis))
     every, shared = P(*axes), P()
     state = jax.tree.map(
         lambda axis: shared if axis is None else every,
@@ -99,9 +98,5 @@ def over_branches(placement: Placement, learn: Learn, *axes: str) -> Learn:
         is_leaf=lambda axis: axis is None,
     )
     takes, gives = (every, state, every), (state, every)
-    learn = devices.split(placement, mapped.learn, takes, gives)
+    learn = devices.split(placement, learner.learn, takes, gives)
     return jax.jit(learn, donate_argnums=1)
-
-
-def _never(*_: Any) -> Any:
-    raise NotImplementedError

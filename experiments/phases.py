@@ -123,7 +123,7 @@ def explore(config: Config, run: RunFolder) -> None:
         placement=placement,
         random=acting.explorers(parts.env, parts.random, 1, length, placement),
         planned=acting.explorers(parts.env, parts.explorer, horizon, length, placement),
-        learn=loop.over_branches(placement, parts.learner.learn, SEED),
+        learn=loop.over_branches(placement, parts.learner, SEED),
     )
     init = jax.jit(jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES))(
         phase.keys(0)
@@ -193,14 +193,14 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
             parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
             placement, shared_model=False,
         ),
-        learn=loop.over_branches(placement, parts.finetuner.learn, SEED, TASK),
+        learn=loop.over_branches(placement, parts.finetuner, SEED, TASK),
         tasks=names,
         weights=devices.place(placement, weights, TASK),
         explored=step,
     )  # fmt: skip
     explored = source.restore_trial(step, explored_template(config, parts))
     if parts.refitter and not run.steps():
-        explored = refit(config, parts.refitter, explored, step, run)
+        explored = refit(config, parts, explored, step, run)
     capacity = explored.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
     init = _branch(explored, len(names), capacity)
@@ -235,7 +235,7 @@ def _model(
         return found[1]
     if parts.refitter:
         state = source.restore_trial(step, whole)
-        model = model_of(refit(config, parts.refitter, state, step, run))
+        model = model_of(refit(config, parts, state, step, run))
     else:  # all but the model may be missing there
         model = source.restore_trial(step, model_of(whole), part=True)
     run.save(step, model)

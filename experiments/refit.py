@@ -10,9 +10,8 @@ import time
 import jax
 from jax import Array
 
-import jaxpets
 from experiments import loop
-from experiments.build import REFIT, State, trial_keys
+from experiments.build import REFIT, Parts, State, trial_keys
 from experiments.config import Config
 from experiments.parallel import devices
 from experiments.parallel.devices import SEED
@@ -20,18 +19,20 @@ from experiments.storage.folder import RunFolder
 
 
 def refit(
-    config: Config, fitter: jaxpets.Fitter, state: State, step: int, run: RunFolder
+    config: Config, parts: Parts, state: State, step: int, run: RunFolder
 ) -> State:
     """Returns the learner `[S]` after one more fit.
 
     Args:
       config: reads `refit` and `seeds`.
-      fitter: made with these numbers.
+      parts: made with these numbers, a refitter among them.
       state: learner `[S]` explored until trial `step`; consumed.
       step: the keys depend on it.
       run: says one line.
     """
     placement = devices.spread(len(config.seeds))
+    fitter = parts.refitter
+    assert fitter is not None
 
     def learn(key: Array, state: State, nothing: tuple[()]) -> tuple[State, object]:
         del nothing  # a learner's new transitions
@@ -42,7 +43,8 @@ def refit(
     rows, epochs = int(state.dataset.size), config.refit.num_epochs
     keys = devices.place(placement, trial_keys(config, REFIT, step), SEED)
     state = devices.place(placement, state, SEED)
-    state, _ = loop.over_branches(placement, learn, SEED)(keys, state, ())
+    learner = parts.learner._replace(learn=learn)
+    state, _ = loop.over_branches(placement, learner, SEED)(keys, state, ())
     state = devices.collect(placement, jax.block_until_ready(state), SEED)
     seconds = time.monotonic() - begin
     run.say(f"refit: {epochs} epochs of {rows:,} transitions  {seconds:.1f} s")

@@ -1,5 +1,7 @@
 """Many seeds of one learner, side by side in one program."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -45,28 +47,28 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
         check_keys("keys", keys, num_seeds)
         return jax.vmap(learner.init, out_axes=SEED_AXES)(keys)
 
+    def call(
+        one: Callable[..., tuple[LearnerState, Any]],
+        keys: Array,
+        state: LearnerState,
+        *rest: Any,
+    ) -> tuple[LearnerState, Any]:
+        check_keys("keys", keys, num_seeds)
+        if num_seeds == 1:
+            state, output = one(keys[0], _only(state), *_only(rest))
+            return _as_one_of_many(state), _many(output)
+        mapped = jax.vmap(one, (0, SEED_AXES, *(0 for _ in rest)), (SEED_AXES, 0))
+        return mapped(keys, state, *rest)
+
     def learn(
         keys: Array, state: LearnerState, transitions: Transition
     ) -> tuple[LearnerState, FitMetrics]:
-        check_keys("keys", keys, num_seeds)
-        if num_seeds == 1:
-            state, metrics = learner.learn(keys[0], _only(state), _only(transitions))
-            return _as_one_of_many(state), _many(metrics)
-        mapped = jax.vmap(learner.learn, (0, SEED_AXES, 0), (SEED_AXES, 0))
-        return mapped(keys, state, transitions)
+        return call(learner.learn, keys, state, transitions)
 
     def step(
         planner: Planner, keys: Array, state: LearnerState
     ) -> tuple[LearnerState, TrialOutput]:
-        check_keys("keys", keys, num_seeds)
-
-        def one(key: Array, state: LearnerState) -> tuple[LearnerState, TrialOutput]:
-            return learner.step(planner, key, state)
-
-        if num_seeds == 1:
-            state, output = one(keys[0], _only(state))
-            return _as_one_of_many(state), _many(output)
-        return jax.vmap(one, (0, SEED_AXES), (SEED_AXES, 0))(keys, state)
+        return call(functools.partial(learner.step, planner), keys, state)
 
     return Learner(init, learn, step)
 
