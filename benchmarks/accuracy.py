@@ -30,7 +30,7 @@ from experiments.build import build
 from experiments.entries import from_json
 from experiments.errors import RunError
 from experiments.presets import PRESETS
-from experiments.storage import checkpoint, rundir
+from experiments.storage.folder import RunFolder
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (
@@ -45,7 +45,7 @@ Imagine = Callable[[Array, Array, Array], tuple[Array, dict[str, Array]]]
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every rollout and reward."""
-    starts, scale = states(args.run / "trajectories.npz", args.states)
+    starts, scale = states(RunFolder(args.run).trajectories, args.states)
     params, size = explored(args.run, workloads.chosen_size(args))
     exact = imagine(params, size, "f32")
     for name in args.rollout:
@@ -110,7 +110,8 @@ def explored(
 def _explored(
     folder: Path, search: workloads.Size
 ) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
-    config = from_json(rundir.read_json(folder / "config.json"), PRESETS["smoke"])
+    run = RunFolder(folder)
+    config = from_json(run.config(), PRESETS["smoke"])
     num_members = config.model.num_members
     if num_members < 2 or search.num_particles % num_members:
         raise SystemExit(
@@ -120,7 +121,7 @@ def _explored(
     if config.model.state_margin != jaxpets.EnsembleConfig().state_margin:
         raise SystemExit(f"{folder} has its own --model.state-margin")
     template = phases.model_of(phases.explored_template(config, build(config)))
-    found = checkpoint.restore(folder / "checkpoints", template, warn=print)
+    found = run.restore(template)
     if found is None:
         raise SystemExit(f"there is no checkpoint in {folder}")
     params = jax.tree.map(lambda x: x[0], found[1].params)

@@ -132,7 +132,7 @@ def _explored(config: Config) -> Config:
     They are numbers: what to call it and where to write are never another run's.
     """
     folder = _source(config)
-    path = folder / "config.json"
+    path = folder / rundir.CONFIG
     if not path.is_file():
         raise CheckpointError(
             f"there is no exploration run in {folder}. Run --phase explore first, or "

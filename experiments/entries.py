@@ -24,7 +24,7 @@ from typing import (
 
 import msgspec
 
-from experiments.config import Config, Mark, Run, part
+from experiments.config import Config, Mark, Run
 from experiments.errors import CheckpointError
 
 T = TypeVar("T")
@@ -156,8 +156,6 @@ def differences(old: Any, new: Any) -> list[str]:
         if dataclasses.is_dataclass(hint) and name not in old
     }
     then = dataclasses.replace(then, **unsaid)
-    if part(then, Run) == part(now, Run):
-        return []
     pairs = {entry.name: (entry.of(then), entry.of(now)) for entry in entries(Run)}
     return [
         f"{name}: {to_json(pair[0])} (there) vs {to_json(pair[1])} (now)"

@@ -61,18 +61,25 @@ def _dispatch(config: Config) -> None:
         for path in report.write_report(config.out, config.out / "report"):
             distributed.say(f"wrote {path}")
         return
+    with _without_gl():
+        run = _run(config)
+    if config.video is not None and distributed.is_first():
+        _video(config, run)
+
+
+def _run(config: Config) -> "RunFolder":
+    """Runs a phase that leaves a folder, and returns that."""
     from experiments.storage.folder import RunFolder
 
+    check_cpu(config)
     source = RunFolder(cli.explored_run(config))
-    with _without_gl():
-        check_cpu(config)
     if config.phase == "explore":
         with _opened(config, source.path) as run:
             from experiments import phases
 
             phases.explore(config, run)
         run.say(f"next: python -m experiments.run --phase zero-shot --from {run.path}")
-        return
+        return run
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
     with _opened(config, folder) as run:
@@ -80,8 +87,7 @@ def _dispatch(config: Config) -> None:
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
         phase(config, source, run, step)
-    if config.video is not None and distributed.is_first():
-        _video(config, run)
+    return run
 
 
 def _variant(config: Config, step: int) -> str:
@@ -101,11 +107,7 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     if (config.phase, config.task) == ("finetune", "all"):
         branches *= NUM_TASKS
     size = _NEEDED_BYTES * branches
-    with (
-        _without_gl(),
-        stoppable(),
-        folder.open_run(path, plain, differences, size) as run,
-    ):
+    with stoppable(), folder.open_run(path, plain, differences, size) as run:
         yield run
 
 
