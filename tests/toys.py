@@ -96,6 +96,11 @@ class Record(NamedTuple):
     state: Any
 
 
+def bumpy(actions):
+    """Values `[N]` of sequences `[N, H, A]` with many optima."""
+    return jnp.sin(5 * actions).sum((1, 2)) - jnp.sum(actions**2, (1, 2))
+
+
 def record(search, value_fn, state=None, seed=0, args=()):
     """Runs one search on `value_fn(actions [N, H, A], *args)`, keeping every sample."""
     step, kept = _recording(search, value_fn)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from toys import record
+from toys import bumpy, record
 
 import jaxpets
 
@@ -32,10 +32,6 @@ def quadratic(optimum):
         return -jnp.sum((actions - optimum) ** 2, (1, 2))
 
     return objective
-
-
-def bumpy(actions):
-    return jnp.sin(5 * actions).sum((1, 2)) - jnp.sum(actions**2, (1, 2))
 
 
 @pytest.mark.parametrize("legacy", [False, True])

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from toys import record
+from toys import bumpy, record
 
 import jaxpets
 from jaxpets._src.icem import _colored_noise
@@ -25,10 +25,6 @@ def search(**changes):
 
 
 SEARCH = search()
-
-
-def bumpy(actions):
-    return jnp.sin(5 * actions).sum((1, 2)) - jnp.sum(actions**2, (1, 2))
 
 
 def rows(sequences):
