@@ -83,7 +83,13 @@ def run(
             timed = [{**row, "seconds": seconds} for row in rows]
             folder.record(trial, timed, learned, finite=(learned.params, learned.fit))
             text = f"{phase.name} {trial}/{last}  {records.describe(rows)}"
-            progress.line(f"{text}  {sum(seconds.values()):.1f} s")
+            text = f"{text}  {sum(seconds.values()):.1f} s"
+            progress.line(text)
+            rate, left = progress.pace()
+            folder.update(
+                trial=trial, num_trials=last, line=text,
+                steps_per_second=rate, seconds_left=left,
+            )  # fmt: skip
     return trials
 
 

@@ -6,22 +6,21 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from experiments import cli
+from experiments import cli, signals
 from experiments.config import NUM_TASKS, Config
 from experiments.cost import check_cpu, memory_advice
 from experiments.entries import differences, from_json, to_json
 from experiments.errors import (
     CheckpointError,
-    InterruptedRun,
     OutOfMemoryError,
     RunError,
     StorageError,
     UsageError,
+    last_line,
 )
 from experiments.parallel import distributed
-from experiments.progress import stoppable
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
     from experiments.storage.folder import RunFolder
@@ -48,8 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RunError as error:
         if "--debug" in arguments:
             traceback.print_exc()
-        kind = "stopped" if isinstance(error, InterruptedRun) else "error"
-        print(f"{kind}: {error}", file=sys.stderr)
+        signals.say(last_line(error))
         return error.exit_code
     return 0
 
@@ -107,7 +105,12 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     if (config.phase, config.task) == ("finetune", "all"):
         branches *= NUM_TASKS
     size = _NEEDED_BYTES * branches
-    with stoppable(), folder.open_run(path, plain, differences, size) as run:
+    with (
+        signals.stoppable() as late,
+        folder.open_run(path, plain, differences, size) as run,
+        _plain_errors(config),
+    ):
+        late.tell = run.interrupted
         yield run
 
 
@@ -179,5 +182,16 @@ def _without_gl() -> Iterator[None]:
             os.environ["MUJOCO_GL"] = chosen
 
 
+def _command() -> NoReturn:
+    code: Any = 1
+    try:
+        code = main()
+    except SystemExit as error:
+        code = error.code
+    except BaseException:
+        traceback.print_exc()
+    signals.leave(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    _command()

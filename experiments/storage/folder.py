@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.errors import CheckpointError, InterruptedRun, RunError
+from experiments import errors
+from experiments.errors import CheckpointError, InterruptedRun, StorageError
 from experiments.parallel import distributed
-from experiments.storage import checkpoint, metrics, pytrees, rundir
+from experiments.storage import checkpoint, metrics, pytrees, rundir, status
 from experiments.storage.environment import compare_environment, environment
+from experiments.storage.status import Writer
 
 # (of the start, of now) -> what differs between two configs in JSON.
 Differences = Callable[[Any, Any], list[str]]
@@ -27,10 +29,12 @@ class RunFolder(NamedTuple):
 
     path: Path
     milestones: Sequence[int] = ()  # trials whose checkpoints are never dropped
+    status: Writer | None = None  # of a run that this process writes to
 
     def say(self, text: str) -> None:
-        """Prints a line for the user."""
+        """Prints lines for the user; the last one gets into status.json."""
         distributed.say(text)
+        self.update(line=text.splitlines()[-1])
 
     # Reading.
 
@@ -113,6 +117,20 @@ class RunFolder(NamedTuple):
         """Replaces a JSON file."""
         distributed.on_first(lambda: rundir.write_json(self.path / name, data))
 
+    def update(self, **changes: Any) -> None:
+        """Puts into status.json how far the run is.
+
+        Args:
+          **changes: fields of `status.Status`.
+        """
+        if self.status is not None:
+            self.status.update(**changes)
+
+    def interrupted(self, reason: str) -> None:
+        """Puts into status.json that this process was stopped; any thread may."""
+        if self.status is not None:
+            self.status.end(status.INTERRUPTED, reason)
+
     @property
     def trajectories(self) -> Path:
         """The file of `save_trajectories`."""
@@ -177,32 +195,31 @@ def open_run(
       CheckpointError: if the folder is in use or belongs to another config.
       StorageError: if it cannot be written to.
     """
-    run = RunFolder(path, tuple(config["milestones"]))
-    held = _held(path, config, differences, needed_bytes)
+    writer = Writer(path, config["phase"])
+    held = _held(path, config, differences, needed_bytes, writer)
     with distributed.held_by_first(held):
-        yield run
+        own = writer if distributed.is_first() else None
+        yield RunFolder(path, tuple(config["milestones"]), own)
 
 
 @contextlib.contextmanager
 def _held(
-    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
-) -> Iterator[None]:
+    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
+    writer: Writer,
+) -> Iterator[None]:  # fmt: skip
     rundir.probe(path, needed_bytes)
     with rundir.lock(path):
         _describe(path, config, differences)
-        _status(path, "running")
+        writer.begin()
         try:
             yield
-        except InterruptedRun as error:
-            _status(path, "interrupted", str(error))
-            raise InterruptedRun(
-                f"{error}; at most the trial under way is lost. Continue with the same "
-                "command."
-            ) from error
-        except RunError as error:
-            _status(path, "failed", str(error))
+        except BaseException as error:
+            stopped = isinstance(error, InterruptedRun | KeyboardInterrupt)
+            with contextlib.suppress(StorageError):  # the first error says more
+                state = status.INTERRUPTED if stopped else status.FAILED
+                writer.end(state, errors.reason(error))
             raise
-        _status(path, "complete")
+        writer.end(status.COMPLETE)
 
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
@@ -221,11 +238,6 @@ def _describe(path: Path, config: dict[str, Any], differences: Differences) -> N
     old = rundir.read_json(path / rundir.ENVIRONMENT)
     for line in compare_environment(old, environment()):
         distributed.say(f"warning: {line}")
-
-
-def _status(path: Path, state: str, reason: str = "") -> None:
-    status = {"state": state, "reason": reason, "time": rundir.now()}
-    rundir.write_json(path / rundir.STATUS, status)
 
 
 def _shared(state: Any, template: Any) -> Any:

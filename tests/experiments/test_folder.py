@@ -1,6 +1,7 @@
 """A run's folder: what is recorded comes back, and what becomes of a run is written."""
 
 import json
+import os
 
 import jax.numpy as jnp
 import numpy as np
@@ -82,18 +83,56 @@ def test_what_becomes_of_a_run_is_written(tmp_path):
         assert run.path == tmp_path and run.milestones == (1,)
         assert run.config() == CONFIG
         assert status(tmp_path)["state"] == "running"
+        run.update(trial=2, num_trials=3)
+        run.say("a line\nand the last")
         with pytest.raises(CheckpointError, match="in use by pid"), opened(tmp_path):
             raise AssertionError("two hold it")
-    assert status(tmp_path)["state"] == "complete"
-    with pytest.raises(InterruptedRun, match=r"SIGTERM; .* command"):  # noqa: SIM117
-        with opened(tmp_path):
-            raise InterruptedRun("SIGTERM")
-    assert status(tmp_path) | {"time": ""} == {
-        "state": "interrupted", "reason": "SIGTERM", "time": "",
-    }  # fmt: skip
-    with pytest.raises(StorageError), opened(tmp_path):
-        raise StorageError("the disk is full")
-    assert status(tmp_path)["reason"] == "the disk is full"
+    done = status(tmp_path)
+    assert (done["state"], done["trial"], done["num_trials"]) == ("complete", 2, 3)
+    assert (done["phase"], done["line"]) == ("explore", "and the last")
+    assert (done["pid"], done["reason"]) == (os.getpid(), "")
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "reason"),
+    [
+        (InterruptedRun("SIGTERM"), "interrupted", "SIGTERM"),
+        (KeyboardInterrupt(), "interrupted", "KeyboardInterrupt"),
+        (StorageError("the disk is full"), "failed", "the disk is full"),
+        (MemoryError(), "failed", "MemoryError"),
+        (OSError(28, "No space"), "failed", "OSError: [Errno 28] No space"),
+        (RuntimeError("a bug\nof ours"), "failed", "RuntimeError: a bug"),
+        (SystemExit(3), "failed", "SystemExit: 3"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_no_end_leaves_a_run_running(tmp_path, error, state, reason):
+    with pytest.raises(type(error)), opened(tmp_path) as run:
+        run.update(trial=1)
+        raise error
+    found = status(tmp_path)
+    assert (found["state"], found["reason"], found["trial"]) == (state, reason, 1)
+
+
+def test_a_full_disk_does_not_keep_the_end_a_secret(tmp_path, monkeypatch):
+    def full(_file):
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(RuntimeError), opened(tmp_path) as run:
+        run.update(line="x" * 1000)
+        monkeypatch.setattr(rundir.os, "fsync", full)
+        run.update(line="short")
+        raise RuntimeError("a bug")
+    found = status(tmp_path)
+    assert (found["state"], found["line"]) == ("failed", "short")
+
+
+def test_what_comes_after_the_end_is_not_written(tmp_path):
+    with opened(tmp_path) as run:
+        run.interrupted("SIGTERM")  # from another thread
+        run.update(trial=7)
+    found = status(tmp_path)
+    assert (found["state"], found["trial"]) == ("interrupted", None)
 
 
 @pytest.mark.parametrize(
