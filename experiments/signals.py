@@ -20,13 +20,14 @@ from experiments.errors import InterruptedRun, StorageError, last_line
 
 _URGENT = (signal.SIGINT, signal.SIGTERM)  # if they come again
 _SIGNALS = (*_URGENT, signal.SIGHUP)  # of which a terminal that closes sends several
-_SECONDS = 4.0  # that what was asked to stop has for it
 
 
 class Stop:
     """What is to be done where a run does not stop in time."""
 
     def __init__(self) -> None:
+        self.seconds = 4.0
+        """How long it has, from the first signal on."""
         self.tell: Callable[[str], None] = lambda reason: None
         """Called with the reason, from another thread, before the process ends."""
 
@@ -126,7 +127,7 @@ def _watch(told: socket.socket, late: Stop) -> None:
     first = _next(told, _SIGNALS)
     if first is None:
         return
-    told.settimeout(_SECONDS)
+    told.settimeout(late.seconds)
     try:
         second = _next(told, _URGENT)
     except TimeoutError:

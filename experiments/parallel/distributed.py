@@ -23,6 +23,8 @@ from experiments.errors import (
     UsageError,
 )
 
+_CONNECTIONS = ("Gloo", "NCCL")  # what carries an exchange; its errors have the name
+
 
 class ProcessSpec(NamedTuple):
     """This process among the others; None is for jax to find out."""
@@ -167,10 +169,12 @@ def _from_all(array: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _with_others() -> Iterator[None]:
-    """Ends this process like a signal where another one no longer answers."""
+    """Stops this process, as a signal does, where another one no longer answers."""
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # as jax has both
+        if not any(name in str(error) for name in _CONNECTIONS):
+            raise
         other = "another process"
         if jax.process_count() == 2:
             other = f"process {1 - jax.process_index()}"

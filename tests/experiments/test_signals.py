@@ -21,8 +21,8 @@ STUCK = """
     import ctypes
     import sys
     from experiments import signals
-    signals._SECONDS = float(sys.argv[1])
     with signals.stoppable() as late:
+        late.seconds = float(sys.argv[1])
         late.tell = lambda reason: print(f"told {reason}", flush=True)
         mutex = ctypes.create_string_buffer(128)
         print("stuck", flush=True)
@@ -74,10 +74,9 @@ def test_a_loop_stops_at_its_next_tick():
 
 def test_a_tick_that_does_not_come_is_not_waited_for(monkeypatch, capsys):
     told, left = [], threading.Event()
-    monkeypatch.setattr(signals, "_SECONDS", 0.1)
     monkeypatch.setattr(signals, "leave", lambda code: (told.append(code), left.set()))
     with signals.stoppable() as late, Progress(10, 0, "walk").interruptible():
-        late.tell = told.append
+        late.seconds, late.tell = 0.1, told.append
         os.kill(os.getpid(), signal.SIGTERM)
         assert left.wait(20)
     assert told == ["SIGTERM", 75]
