@@ -1,9 +1,60 @@
 """Files that survive a power cut, and disk errors as one line for the user."""
 
+import contextlib
 import os
 import re
+import secrets
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+
+from experiments.errors import storage_errors
+
+_DRAFT = ".tmp-"
+
+
+@contextlib.contextmanager
+def draft(path: Path) -> Iterator[Path]:
+    """Yields a name beside a file that nothing has, and removes what it came to name.
+
+    It has the suffix of the file, from which libraries guess what to write.
+    """
+    name = path.with_name(f"{_DRAFT}{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield name
+    finally:
+        name.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yields a draft of a file, which takes its place at once when the block ends.
+
+    A reader sees the old file or the new one, after a power cut too; a failure leaves
+    the old one. A link there is replaced, not followed.
+
+    Raises:
+      StorageError: if the disk refuses.
+    """
+    with storage_errors(f"write {path}"):
+        with draft(path) as name:
+            yield name
+            sync(name)
+            name.replace(path)
+        sync(path.parent)
+
+
+def write(path: Path, data: bytes) -> None:
+    """Replaces a file, as `replaced` does."""
+    with replaced(path) as name:
+        name.write_bytes(data)
+
+
+def sweep(folder: Path) -> None:
+    """Removes the drafts of killed processes; nobody may be writing there."""
+    for name in folder.glob(f"{_DRAFT}*"):
+        with contextlib.suppress(OSError):
+            name.unlink()
 
 
 def sync(path: Path) -> None:

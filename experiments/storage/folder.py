@@ -5,7 +5,6 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ import numpy as np
 
 from experiments.errors import CheckpointError, InterruptedRun, RunError
 from experiments.parallel import distributed
-from experiments.storage import checkpoint, metrics, pytrees, rundir
+from experiments.storage import checkpoint, disk, metrics, pytrees, rundir
 from experiments.storage.environment import compare_environment, environment
 
 # (of the start, of now) -> what differs between two configs in JSON.
@@ -156,9 +155,8 @@ class RunFolder(NamedTuple):
         )  # fmt: skip
 
     def _save_trajectories(self, arrays: Mapping[str, Any]) -> None:
-        data = io.BytesIO()
-        np.savez_compressed(data, **arrays)
-        rundir.replace_file(self.trajectories, data.getvalue())
+        with disk.replaced(self.trajectories) as draft:
+            np.savez_compressed(draft, **arrays)
 
 
 @contextlib.contextmanager
@@ -187,8 +185,9 @@ def open_run(
 def _held(
     path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
 ) -> Iterator[None]:
-    rundir.probe(path, needed_bytes)
     with rundir.lock(path):
+        disk.sweep(path)
+        rundir.probe(path, needed_bytes)
         _describe(path, config, differences)
         _status(path, "running")
         try:
