@@ -269,6 +269,8 @@ def writes(tree):
         match node:
             case ast.withitem(ast.Call(ast.Attribute(attr="replaced")), ast.Name(id)):
                 drafts.add(id)
+            case _:
+                pass
     for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
         name = ast.unparse(call.func).rpartition(".")[2]
         words = [x.value for x in call.args if isinstance(x, ast.Constant)]

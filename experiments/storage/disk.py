@@ -5,10 +5,11 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments.errors import storage_errors
+from experiments.errors import StorageError, storage_errors
 
 _DRAFT = ".tmp-"
 
@@ -55,6 +56,49 @@ def sweep(folder: Path) -> None:
     for name in folder.glob(f"{_DRAFT}*"):
         with contextlib.suppress(OSError):
             name.unlink()
+
+
+@contextlib.contextmanager
+def opened(path: Path, flags: int) -> Iterator[int]:
+    """Opens a file, made if need be, to write to it where it stands.
+
+    Raises:
+      StorageError: if the disk refuses, or as `check_own`.
+    """
+    check_own(path)
+    flags |= os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    with storage_errors(f"write {path}"):
+        file = os.open(path, flags, 0o666)
+        try:
+            yield file
+        finally:
+            os.close(file)
+
+
+def check_own(path: Path, *, folder: bool = False) -> None:
+    """Refuses to write to a file or a folder that also is elsewhere, as links are.
+
+    Args:
+      path: need not exist.
+      folder: whether it must be one.
+
+    Raises:
+      StorageError: if it is a link, hard or soft, or of another kind.
+    """
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return
+    if folder:
+        good = stat.S_ISDIR(status.st_mode)
+    else:
+        good = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+    if not good:
+        kind = "folder" if folder else "file"
+        raise StorageError(
+            f"{path} is a link, or no {kind}; a run writes to its own only. Put a copy "
+            "of what it stands for in its place, or move it away."
+        )
 
 
 def sync(path: Path) -> None:
