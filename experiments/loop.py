@@ -50,10 +50,12 @@ class Phase(Protocol):
         ...
 
 
-def run(
-    folder: RunFolder, phase: Phase, init: State, first: int, last: int
-) -> Trials | None:
-    """Runs trials `first + 1` to `last`, or what is left of them; saves after each."""
+def run(folder: RunFolder, phase: Phase, init: State, first: int, last: int) -> bool:
+    """Runs trials `first + 1` to `last`, or what is left of them; saves after each.
+
+    Returns:
+      Whether anything was left.
+    """
 
     def place(tree: Any) -> Any:
         return devices.place(phase.placement, tree, *phase.axes)
@@ -61,11 +63,11 @@ def run(
     def collect(tree: Any) -> Any:
         return devices.collect(phase.placement, tree, *phase.axes)
 
-    done, state = folder.resume(init) or (first, init)
+    done, state = folder.resume(init, first) or (first, init)
     if done >= last:
         folder.say(f"already complete: {last - first} of {last - first} trials.")
-        return None
-    state, trials, steps = place(state), None, phase.trial_length
+        return False
+    state, steps = place(state), phase.trial_length
     progress = Progress((last - first) * steps, (done - first) * steps, phase.name)
     with progress.interruptible():
         for trial in range(done + 1, last + 1):
@@ -90,7 +92,7 @@ def run(
                 trial=trial, num_trials=last, line=text,
                 steps_per_second=rate, seconds_left=left,
             )  # fmt: skip
-    return trials
+    return True
 
 
 def over_branches(placement: Placement, learner: jaxpets.Learner, *axes: str) -> Learn:

@@ -129,9 +129,9 @@ def explore(config: Config, run: RunFolder) -> None:
         phase.keys(0)
     )
     last = config.num_trials
-    trials = loop.run(run, phase, init, 0, last)
+    went_on = loop.run(run, phase, init, 0, last)
     data = data_of(explored_template(config, parts))
-    coverage.write(run, config.seeds, data, last, anew=trials is not None)
+    coverage.write(run, config.seeds, data, last, anew=went_on)
 
 
 def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
@@ -139,14 +139,13 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
 
     The jump-start of Table 1. The model that acts is saved beside its log.
     """
-    if run.has_log():  # written once, at the end
-        run.say(
-            f"already complete: {config.eval_trials} of {config.eval_trials} trials."
-        )
+    names, weights = _tasks(config)
+    count = config.eval_trials
+    if run.performed(len(config.seeds) * len(names) * count):
+        run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
     model = _model(config, source, run, step, parts)
-    names, weights = _tasks(config)
     placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
     actors = acting.evaluators(
         parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
@@ -173,7 +172,8 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
         for trial in range(config.eval_trials)
     ]
     rows = records.rows(labels, trials)
-    run.save_trajectories(**records.trajectories(trials, config.seeds, names))
+    paths = records.trajectories(trials.transitions, config.seeds, names)
+    run.save_trajectories(paths)
     run.log(rows)
     run.say(records.summary(rows, names, time.monotonic() - begin))
 
@@ -204,10 +204,17 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
     capacity = explored.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
     init = _branch(explored, len(names), capacity)
-    trials = loop.run(run, phase, init, step, step + config.finetune_trials)
-    if trials is not None:
-        trials = jax.tree.map(lambda x: x[:, :, None], trials)
-        run.save_trajectories(**records.trajectories(trials, config.seeds, names))
+    data = data_of(jax.eval_shape(lambda: init))
+    last = step + config.finetune_trials
+    went_on = loop.run(run, phase, init, step, last)
+    if went_on or not run.has_trajectories():
+        if not went_on:
+            run.say(f"{run.trajectories} is not whole: made again.")
+        # The last checkpoint holds the trial, so that no stop can lose it.
+        dataset = run.restore_trial(last, data, part=True).dataset
+        rows = slice(int(dataset.size) - config.task_length, int(dataset.size))
+        shown = jax.tree.map(lambda x: x[:, :, None, rows], dataset.data)
+        run.save_trajectories(records.trajectories(shown, config.seeds, names))
 
 
 def explored_template(config: Config, parts: Parts) -> State:

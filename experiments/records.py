@@ -62,15 +62,15 @@ def _fit(
 
 
 def trajectories(
-    trials: Trials, seeds: Sequence[int], tasks: Sequence[str]
+    transitions: jaxpets.Transition, seeds: Sequence[int], tasks: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """Returns the observations of trials `[S, K, R, T, *]` and what they belong to."""
-    returns, _ = score(trials.transitions)
+    returns, _ = score(transitions)
     columns = [half_cheetah.TASK_NAMES.index(task) for task in tasks]
     own = [np.asarray(returns)[:, k, :, c] for k, c in enumerate(columns)]
     return {
-        "obs": np.asarray(trials.transitions.next_obs),
-        "action": np.asarray(trials.transitions.action),
+        "obs": np.asarray(transitions.next_obs),
+        "action": np.asarray(transitions.action),
         "seeds": np.asarray(seeds),
         "tasks": np.asarray(tasks),
         "returns": np.stack(own, 1),

@@ -253,6 +253,46 @@ def test_orbax_has_one_home():
     assert found == ORBAX
 
 
+# Who may write a file where it stands: the writer itself, the log, which is appended
+# to, the lock and the probe, and the seal of a checkpoint that is still a draft.
+WRITERS = {"storage.disk", "storage.metrics", "storage.rundir", "storage.step_folders"}
+WRITING = {
+    "write_text", "write_bytes", "savez", "savez_compressed", "savefig", "copy",
+    "copy2", "copyfile", "write_frames",
+}  # fmt: skip
+
+
+def writes(tree):
+    """Returns the calls that write a file which no `disk.replaced` has given."""
+    found, drafts = [], {"target"}  # a target is what a caller has given
+    for node in ast.walk(tree):
+        match node:
+            case ast.withitem(ast.Call(ast.Attribute(attr="replaced")), ast.Name(id)):
+                drafts.add(id)
+            case _:
+                pass
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func).rpartition(".")[2]
+        words = [x.value for x in call.args if isinstance(x, ast.Constant)]
+        mode = any(set(str(word)) & set("wax+") for word in words)
+        if name in WRITING or (name == "open" and mode):
+            text = ast.unparse(call)
+            if not any(f"({draft}" in text.replace("str(", "(") for draft in drafts):
+                found.append(text)
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS.keys() - WRITERS))
+def test_files_are_replaced_at_once(name):
+    assert not writes(ast.parse(path_of(name).read_text()))
+
+
+def test_writing_is_seen():
+    assert all(writes(ast.parse(path_of(name).read_text())) for name in WRITERS)
+    torn = "np.savez(path, x=1); file.open('rb'); open(path, 'w').write('x')"
+    assert len(writes(ast.parse(torn))) == 2
+
+
 @pytest.mark.parametrize("name", sorted(EXPERIMENTS))
 def test_sizes_stay_small_outside(name):
     assert len(path_of(name).read_text().splitlines()) <= 300

@@ -70,7 +70,7 @@ def write(
     Raises:
       CheckpointError, StorageError: if the one cannot be read or the other written.
     """
-    if run.has(_FILE) and not anew:
+    if run.has_json(_FILE) and not anew:
         return
     dataset = run.restore_trial(step, template, part=True).dataset
     filled = np.asarray(dataset.data.next_obs)[:, : int(dataset.size)]

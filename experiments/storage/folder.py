@@ -5,7 +5,6 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,15 @@ import numpy as np
 from experiments import errors
 from experiments.errors import CheckpointError, InterruptedRun, StorageError
 from experiments.parallel import distributed
-from experiments.storage import checkpoint, metrics, pytrees, rundir, status
+from experiments.storage import (
+    checkpoint,
+    disk,
+    metrics,
+    pytrees,
+    rundir,
+    status,
+    trajectories,
+)
 from experiments.storage.environment import compare_environment, environment
 from experiments.storage.status import Writer
 
@@ -46,13 +53,20 @@ class RunFolder(NamedTuple):
         """Returns the trials that have a checkpoint, oldest first."""
         return distributed.on_first(lambda: checkpoint.steps(self._checkpoints))
 
-    def has(self, name: str) -> bool:
-        """Returns whether there is a file of this name with something in it."""
-        return distributed.on_first(lambda: metrics.log_size(self.path / name) > 0)
+    def has_json(self, name: str) -> bool:
+        """Returns whether there is an object in a file of this name."""
+        return distributed.on_first(lambda: bool(rundir.find_json(self.path / name)))
 
-    def has_log(self) -> bool:
-        """Returns whether a row was logged."""
-        return self.has(rundir.METRICS)
+    def has_trajectories(self) -> bool:
+        """Returns whether what a video is made of is there, and whole."""
+        return distributed.on_first(lambda: trajectories.is_whole(self.trajectories))
+
+    def performed(self, num_rows: int) -> bool:
+        """Returns whether a phase that ends with so many rows has ended.
+
+        If it has and then lost a part, what is left of its log is set aside.
+        """
+        return distributed.on_first(lambda: self._performed(num_rows))
 
     def restore(self, template: Any, *, part: bool = False) -> tuple[int, Any] | None:
         """Returns trial and state of the last checkpoint, None before the first.
@@ -74,11 +88,21 @@ class RunFolder(NamedTuple):
         assert found is not None  # a trial that is asked for and not there is an error
         return found[1]
 
-    def resume(self, template: Any) -> tuple[int, Any] | None:
-        """Returns what `restore` does, and cuts off what was logged after it."""
+    def resume(self, template: Any, first: int = 0) -> tuple[int, Any] | None:
+        """Returns what `restore` does, and cuts off what was logged after it.
+
+        What the log has lost is said: it costs rows, never a run.
+
+        Args:
+          template: as in `checkpoint.restore`.
+          first: the trial before those of this run.
+        """
         found = self._restore(template, None, False)
-        size = found[2]["log"] if found else 0
-        distributed.on_first(lambda: metrics.cut_log(self._log, size))
+        last, meta = (found[0], found[2]) if found else (first, {})
+        for line in distributed.on_first(
+            lambda: metrics.resume(self._log, first, last, meta.get("rows"))
+        ):
+            self.say(f"warning: {line}")
         return found[:2] if found else None
 
     # Writing.
@@ -97,7 +121,7 @@ class RunFolder(NamedTuple):
 
         def write() -> None:
             metrics.append_rows(self._log, rows)
-            self._save(trial, state, {"log": metrics.log_size(self._log)}, finite)
+            self._save(trial, state, {"rows": len(rows)}, finite)
 
         distributed.on_first(write)
 
@@ -106,12 +130,12 @@ class RunFolder(NamedTuple):
         distributed.on_first(lambda: self._save(step, state, {}, state))
 
     def log(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Appends rows to the log."""
-        distributed.on_first(lambda: metrics.append_rows(self._log, rows))
+        """Writes the log of a phase that ends with it, all rows at once."""
+        distributed.on_first(lambda: metrics.replace_rows(self._log, rows))
 
-    def save_trajectories(self, **arrays: np.ndarray) -> None:
+    def save_trajectories(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes what a video is made of."""
-        distributed.on_first(lambda: self._save_trajectories(arrays))
+        distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
 
     def write_json(self, name: str, data: Any) -> None:
         """Replaces a JSON file."""
@@ -173,10 +197,16 @@ class RunFolder(NamedTuple):
             finite=finite, milestones=self.milestones,
         )  # fmt: skip
 
-    def _save_trajectories(self, arrays: Mapping[str, Any]) -> None:
-        data = io.BytesIO()
-        np.savez_compressed(data, **arrays)
-        rundir.replace_file(self.trajectories, data.getvalue())
+    def _performed(self, num_rows: int) -> bool:
+        found = metrics.rows_by_trial(self._log).total()
+        whole = trajectories.is_whole(self.trajectories)
+        if found == num_rows and whole:
+            return True
+        if found or self.trajectories.exists():
+            what = self._log if found != num_rows else self.trajectories
+            self.say(f"warning: {what} is not whole: performing again.")
+        metrics.cut_log(self._log, 0)
+        return False
 
 
 @contextlib.contextmanager
@@ -207,8 +237,9 @@ def _held(
     path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
     writer: Writer,
 ) -> Iterator[None]:  # fmt: skip
-    rundir.probe(path, needed_bytes)
     with rundir.lock(path):
+        disk.sweep(path)
+        rundir.probe(path, needed_bytes)
         _describe(path, config, differences)
         writer.begin()
         try:

@@ -22,7 +22,8 @@ from experiments.errors import (
     UsageError,
     storage_errors,
 )
-from experiments.storage.disk import free_bytes, megabytes, sync
+from experiments.storage import disk
+from experiments.storage.disk import free_bytes, megabytes
 
 CONFIG = "config.json"
 ENVIRONMENT = "env.json"
@@ -98,16 +99,13 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
     Raises:
       StorageError: It cannot be written, or has less than `needed_bytes` free.
     """
-    path = run_dir / f".probe-{os.getpid()}"
     data = os.urandom(4096)
     with storage_errors(f"write in {run_dir}"):
         run_dir.mkdir(parents=True, exist_ok=True)
-        try:
-            path.write_bytes(data)
-            sync(path)
-            same = path.read_bytes() == data
-        finally:
-            path.unlink(missing_ok=True)
+        with disk.draft(run_dir / ".probe") as probe:
+            probe.write_bytes(data)
+            disk.sync(probe)
+            same = probe.read_bytes() == data
     if not same:
         raise StorageError(f"{run_dir} does not read back what is written. Check it.")
     if (free := free_bytes(run_dir)) < needed_bytes:
@@ -120,20 +118,7 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
 def write_json(path: Path, data: Any) -> None:
     """Replaces a JSON file at once; a reader sees the old file or the new one."""
     text = json.dumps(plain(data), indent=2, allow_nan=False) + "\n"
-    replace_file(path, text.encode())
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Replaces a file at once, and on the disk; a failure leaves the old one."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with storage_errors(f"write {path}"):
-        try:
-            draft.write_bytes(data)
-            sync(draft)
-            draft.replace(path)
-        finally:
-            draft.unlink(missing_ok=True)
-        sync(path.parent)
+    disk.write(path, text.encode())
 
 
 def read_json(path: Path) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from experiments.errors import CheckpointError, StorageError
-from experiments.storage import rundir
+from experiments.storage import disk, rundir
 
 RUNNING, INTERRUPTED, FAILED, COMPLETE, KILLED = (
     "running", "interrupted", "failed", "complete", "killed",
@@ -144,12 +144,9 @@ def _write(path: Path, data: dict[str, Any]) -> None:
         rundir.write_json(path, data)
     except StorageError:
         text = msgspec.json.encode(data)
-        try:
-            with path.open("rb+") as file:
-                file.write(text)
-                file.truncate()
-        except OSError:
-            raise StorageError(f"cannot write {path}.") from None
+        with disk.opened(path, os.O_WRONLY) as file:
+            os.pwrite(file, text, 0)
+            os.ftruncate(file, len(text))
 
 
 def _is_there(pid: int, started: int | None) -> bool:

@@ -9,7 +9,6 @@ run's own back.
 
 import argparse
 import dataclasses
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
 from experiments.presets import PRESETS, PRETRAINED_PLANNER
-from experiments.storage import metrics, rundir
+from experiments.storage import disk, metrics, rundir
 from experiments.storage.folder import RunFolder
 
 
@@ -62,9 +61,11 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     model = RunFolder(folder)
     model.save(step, state)
     model.write_json(rundir.CONFIG, to_json(shipped))
-    shutil.copyfile(run / rundir.ENVIRONMENT, folder / rundir.ENVIRONMENT)
+    origins = {rundir.ENVIRONMENT: run / rundir.ENVIRONMENT}
     for file in (rundir.CONFIG, rundir.ENVIRONMENT):  # how it came to be what it is
-        shutil.copyfile(evaluated.path / file, folder / f"performed-{file}")
+        origins[f"performed-{file}"] = evaluated.path / file
+    for file, origin in origins.items():
+        disk.write(folder / file, origin.read_bytes())
     rows = metrics.read(run / rundir.METRICS, plain)
     model.log([row.data for row in rows if row.seed == seed])
     return folder

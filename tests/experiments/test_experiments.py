@@ -225,11 +225,26 @@ def test_two_seeds_through_all_phases(straight, tmp_path, capsys, monkeypatch):
     _check_task(tuned, [(0, 4), (7, 4), (0, 5), (7, 5)], trials=1)
     assert all(set(row["fit"]) == FIT for row in rows(tuned))
     assert [row["fit"]["num_updates"] for row in rows(tuned)] == [5, 5, 7, 7]
+    _check_recovery(tuned, ["--phase", "finetune", *task], capsys)
 
     assert main(["--phase", "report", "--out", str(tmp_path)]) == 0
     table = json.loads((tmp_path / "report" / "table1.json").read_text())
     assert "back-flip" in json.dumps(table)
     assert capsys.readouterr().out == ""
+
+
+def _check_recovery(tuned, command, capsys):
+    """What a stop after the last checkpoint loses is made again from that."""
+    path, log = tuned / "trajectories.npz", (tuned / "metrics.jsonl").read_bytes()
+    before = dict(np.load(path))
+    os.truncate(path, path.stat().st_size - 50)
+    assert main(command) == 0
+    assert f"{path} is not whole: made again." in capsys.readouterr().err
+    after = dict(np.load(path))
+    assert after.keys() == before.keys()
+    for name, array in before.items():
+        np.testing.assert_array_equal(after[name], array)
+    assert (tuned / "metrics.jsonl").read_bytes() == log
 
 
 def _check_side_by_side(folder, alone):

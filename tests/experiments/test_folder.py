@@ -2,15 +2,17 @@
 
 import json
 import os
+import shutil
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.errors import CheckpointError, InterruptedRun, StorageError
-from experiments.storage import folder, rundir
+from experiments.storage import checkpoint, folder, metrics, rundir
 from experiments.storage.folder import RunFolder
 
+FLIPPED = b'{"trial": 1}\n{"tri\xe1l": 2}\n{"trial": 3}\n'
 CONFIG = {"phase": "explore", "milestones": [1], "seeds": [0]}
 
 
@@ -42,13 +44,15 @@ def status(path):
 def test_a_run_goes_on_from_what_it_recorded(tmp_path):
     run = RunFolder(tmp_path, milestones=(1,))
     assert run.resume(state(0)) is None and run.restore(state(0)) is None
-    assert not run.has_log() and run.steps() == []
+    assert run.steps() == []
     for trial in (1, 2, 3, 4):
         record(run, trial)
-    run.log([{"trial": 5}])  # it was stopped before its checkpoint
-    trial, found = run.resume(state(0))
-    assert trial == 4 and found["w"].tolist() == [4.0] * 3
-    assert trials(run) == [1, 2, 3, 4] and run.has_log()
+    # It was stopped before its checkpoint.
+    metrics.append_rows(tmp_path / rundir.METRICS, [{"trial": 5}])
+    found = run.resume(state(0))
+    assert found is not None and found[0] == 4
+    assert found[1]["w"].tolist() == [4.0] * 3
+    assert trials(run) == [1, 2, 3, 4]
     assert run.steps() == [1, 3, 4]  # a milestone and the last two
     assert run.restore_trial(1, state(0))["w"].tolist() == [1.0] * 3
     with pytest.raises(CheckpointError, match=r"no checkpoint 2 in .*there: 1, 3, 4"):
@@ -65,7 +69,7 @@ def test_a_part_of_a_state_can_be_read(tmp_path):
 
 def test_trajectories_are_replaced_at_once(tmp_path, monkeypatch):
     run = RunFolder(tmp_path)
-    run.save_trajectories(obs=np.arange(3))
+    run.save_trajectories({"obs": np.arange(3)})
 
     def full(_file):
         raise OSError(28, "No space left on device")
@@ -73,9 +77,93 @@ def test_trajectories_are_replaced_at_once(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(rundir.os, "fsync", full)
         with pytest.raises(StorageError, match="No space left"):
-            run.save_trajectories(obs=np.arange(4))
+            run.save_trajectories({"obs": np.arange(4)})
     assert np.load(run.trajectories)["obs"].tolist() == [0, 1, 2]
     assert [path.name for path in tmp_path.iterdir()] == [rundir.TRAJECTORIES]
+
+
+def test_trajectories_are_whole_or_made_again(tmp_path):
+    run = RunFolder(tmp_path)
+    assert not run.has_trajectories()
+    run.save_trajectories({"obs": np.arange(300)})
+    assert run.has_trajectories()
+    whole = run.trajectories.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 3] ^= 1
+    for data in (b"", whole[:-30], bytes(flipped)):
+        run.trajectories.write_bytes(data)
+        assert not run.has_trajectories()
+
+
+@pytest.mark.parametrize(
+    ("damage", "left", "lost"),
+    [
+        (lambda log: log.unlink(), [], "trials 1 to 3"),
+        (lambda log: log.write_bytes(b""), [], "trials 1 to 3"),
+        (lambda log: os.truncate(log, 20), [1], "trials 2 to 3"),
+        (lambda log: log.write_bytes(FLIPPED), [1, 3], "trial 2"),
+    ],
+)
+def test_a_damaged_log_costs_rows_and_not_the_run(tmp_path, capsys, damage, left, lost):
+    run = RunFolder(tmp_path)
+    for trial in (1, 2, 3):
+        record(run, trial)
+    log = tmp_path / rundir.METRICS
+    damage(log)
+    found = run.resume(state(0))
+    assert found is not None and found[0] == 3
+    assert trials(run) == left if left else not log.exists() or not log.read_bytes()
+    assert capsys.readouterr().err == (
+        f"warning: {log} has lost rows of {lost}; the run goes on from checkpoint 3 "
+        "without them.\n"
+    )
+    record(run, 4)
+    assert run.resume(state(0)) and trials(run) == [*left, 4]
+
+
+def test_the_rows_of_a_trial_are_there_together(tmp_path, capsys):
+    """The checkpoint knows how many there are: here two seeds."""
+    run = RunFolder(tmp_path)
+    run.record(1, [{"trial": 1}, {"trial": 1}], state(1), finite=())
+    log = tmp_path / rundir.METRICS
+    os.truncate(log, 13)
+    run.resume(state(0))
+    assert "has lost rows of trial 1;" in capsys.readouterr().err
+    # One of an older version does not, and remembers the size of the log.
+    for path in (tmp_path / rundir.CHECKPOINTS).iterdir():
+        shutil.rmtree(path)
+    checkpoint.save(tmp_path / rundir.CHECKPOINTS, 2, state(2), {"log": 26})
+    metrics.append_rows(log, [{"trial": 2}])
+    assert run.resume(state(0)) and capsys.readouterr().err == ""
+
+
+def test_checkpoints_that_are_gone_are_missed(tmp_path, capsys):
+    run = RunFolder(tmp_path)
+    for trial in (1, 2, 3):
+        record(run, trial)
+    shutil.rmtree(tmp_path / rundir.CHECKPOINTS)
+    assert run.resume(state(0)) is None
+    log = tmp_path / rundir.METRICS
+    assert capsys.readouterr().err == (
+        "warning: there is a log of trials 1 to 3, but no checkpoint; the run starts "
+        f"again at trial 1, and these rows are in {log}.orphan now.\n"
+    )
+    assert trials(run) == []
+    assert run.resume(state(0)) is None and capsys.readouterr().err == ""
+
+
+def test_what_has_performed_is_whole_or_performs_again(tmp_path, capsys):
+    run, log = RunFolder(tmp_path), tmp_path / rundir.METRICS
+    assert not run.performed(2) and capsys.readouterr().err == ""
+    for lost in (log, run.trajectories):
+        run.save_trajectories({"obs": np.arange(3)})
+        run.log([{"trial": 1}, {"trial": 2}])
+        assert run.performed(2) and capsys.readouterr().err == ""
+        lost.write_bytes(lost.read_bytes()[:15])
+        assert not run.performed(2)
+        words = f"warning: {lost} is not whole: performing again.\n"
+        assert capsys.readouterr().err == words
+        assert trials(run) == []
 
 
 def test_what_becomes_of_a_run_is_written(tmp_path):
