@@ -41,6 +41,7 @@ class Parts(NamedTuple):
     explorer: jaxpets.Planner  # phase 1
     actor: jaxpets.Planner  # phase 2; reward data are the weights of a task
     learner: jaxpets.Learner  # phase 1
+    reward_data: jaxpets.RewardData  # of its reward
     refitter: jaxpets.Fitter | None  # between the phases
     finetuner: jaxpets.Learner  # phase 2
 
@@ -84,6 +85,7 @@ def build(config: Config) -> Parts:
         learner=learner(
             config.training, arm.reward_data, config.trial_length, explored
         ),
+        reward_data=arm.reward_data,
         refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
         finetuner=learner(
             config.tuning,

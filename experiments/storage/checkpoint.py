@@ -105,7 +105,8 @@ def restore(
 
     Args:
       directory: as in `save`.
-      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device.
+      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device. Or
+        a function that returns it, of what `pytrees.describe` said of what was saved.
       step: the one to read, or None for the newest.
       part: whether the template may be a part of what was saved, with the same paths.
       warn: gets each warning as one line.
@@ -208,6 +209,8 @@ def _read(directory: Path, number: int, template: Any, part: bool) -> tuple[Any,
             record = manager.restore(number, args=meta)["meta"]
             if record["step"] != number:
                 raise _DamagedError(f"it is step {record['step']}")
+            if callable(template):
+                template = template(record["leaves"])
             if why := _misfit(record, template, part):
                 raise CheckpointError(f"checkpoint {number} in {directory} {why}")
             arrays = manager.restore(number, args=state)["state"]

@@ -29,6 +29,7 @@ from experiments.storage.status import Writer
 
 # (of the start, of now) -> what differs between two configs in JSON.
 Differences = Callable[[Any, Any], list[str]]
+_GOAL = "num_trials"  # of a config: the trial that completes a run may come later
 
 
 class RunFolder(NamedTuple):
@@ -175,7 +176,7 @@ class RunFolder(NamedTuple):
     ) -> tuple[int, Any, dict[str, Any]] | None:
         kept = []
 
-        def read() -> tuple[int, dict[str, Any]] | None:
+        def read() -> tuple[int, dict[str, Any], dict[str, Any]] | None:
             found = checkpoint.restore(
                 self._checkpoints, template, step=step, part=part,
                 warn=lambda line: self.say(f"warning: {line}"),
@@ -183,13 +184,14 @@ class RunFolder(NamedTuple):
             if found is None:
                 return None
             kept.append(found[1])
-            return found[0], found[2]
+            return found[0], found[2], pytrees.describe(found[1])
 
         found = distributed.on_first(read)
         if found is None:
             return None
-        number, meta = found
-        return number, _shared(kept[0] if kept else None, template), meta
+        number, meta, leaves = found
+        like = template(leaves) if callable(template) else template
+        return number, _shared(kept[0] if kept else None, like), meta
 
     def _save(self, step: int, state: Any, meta: dict[str, Any], finite: Any) -> None:
         checkpoint.save(
@@ -255,14 +257,18 @@ def _held(
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Writes config and environment of a new run, compares those of an old one."""
-    if not (path / rundir.CONFIG).exists():
-        rundir.write_json(path / rundir.CONFIG, config)
-    elif lines := differences(rundir.read_json(path / rundir.CONFIG), config):
+    there = path / rundir.CONFIG
+    began = rundir.read_json(there) if there.exists() else config
+    if lines := differences(began, config):
         another = "--name" if config["phase"] == "explore" else "--tag"
         raise CheckpointError(
             f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "
             f"flags, or another {another}."
         )
+    if not there.exists():
+        rundir.write_json(there, config)
+    elif config.get(_GOAL, 0) > began.get(_GOAL, 0):
+        rundir.write_json(there, began | {_GOAL: config[_GOAL]})
     if not (path / rundir.ENVIRONMENT).exists():
         rundir.write_json(path / rundir.ENVIRONMENT, environment())
         return

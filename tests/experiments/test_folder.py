@@ -239,6 +239,21 @@ def test_a_folder_belongs_to_one_config(tmp_path, phase, flag):
     assert RunFolder(tmp_path).config()["seeds"] == [1]
 
 
+def test_a_run_is_given_more_trials_and_never_fewer(tmp_path):
+    for count, kept in ((3, 3), (5, 5), (4, 5)):
+        with opened(tmp_path, CONFIG | {"num_trials": count}) as run:
+            assert run.config() == CONFIG | {"num_trials": kept}
+
+
+def test_a_template_may_be_made_of_what_was_saved(tmp_path):
+    run = RunFolder(tmp_path)
+    run.save(1, {"rows": jnp.ones((5, 2))})
+    trial, found = run.restore(
+        lambda leaves: {"rows": jnp.zeros(leaves["rows"]["shape"])}
+    )
+    assert trial == 1 and found["rows"].tolist() == [[1.0, 1.0]] * 5
+
+
 def test_another_environment_is_said(tmp_path, capsys):
     with opened(tmp_path):
         pass
