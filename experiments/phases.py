@@ -19,6 +19,7 @@ from experiments.acting import Actors, Tick, Trials
 from experiments.build import (
     EXPLORE,
     FINETUNE,
+    SCAN,
     ZERO_SHOT,
     Learn,
     Parts,
@@ -116,6 +117,7 @@ class _Finetuning:
 def explore(config: Config, run: RunFolder) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
+    _say_rollout(run, parts.explored_by)
     placement = _placement(run, len(config.seeds))
     length, horizon = config.chunk_length, config.planner.horizon
     phase = _Exploration(
@@ -152,6 +154,7 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
+    _say_rollout(run, parts.performed_by)
     model = _model(config, source, run, step, parts)
     placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
     actors = acting.evaluators(
@@ -191,6 +194,7 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
     """
     parts = build(config)
+    _say_rollout(run, parts.performed_by)
     names, weights = _tasks(config)
     placement = _placement(run, len(config.seeds), len(names))
     phase = _Finetuning(
@@ -239,6 +243,17 @@ def _model(
         model = source.restore_trial(step, template, part=True)
     run.save(step, model)
     return model
+
+
+def _say_rollout(run: RunFolder, rollout: str) -> None:
+    """Warns where numbers may be others than those so far, or come slowly."""
+    lines = [
+        f"{line}; the last bits may differ" for line in run.computes(rollout=rollout)
+    ]
+    if not lines and rollout.startswith(f"{SCAN} ("):
+        lines = [f"planning takes twice as long as in a kernel: it is a {rollout}"]
+    for line in lines:
+        run.say(f"warning: {line}")
 
 
 def _placement(run: RunFolder, *counts: int) -> Placement:

@@ -3,6 +3,7 @@
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-        with distributed.joined(cli.process_spec(arguments)):
+        with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
             plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
@@ -166,6 +167,18 @@ def _plain_errors(config: Config) -> Iterator[None]:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         raise OutOfMemoryError(memory_advice(config)) from error
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Shows warnings as a line each, without the source that they come from."""
+
+    def show(message: Warning | str, *_: Any) -> None:
+        distributed.say(f"warning: {message}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from experiments.storage import (
     status,
     trajectories,
 )
-from experiments.storage.environment import compare_environment, environment
+from experiments.storage.environment import environment, remember
 from experiments.storage.status import Writer
 
 # (of the start, of now) -> what differs between two configs in JSON.
@@ -137,6 +137,15 @@ class RunFolder(NamedTuple):
     def save_trajectories(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes what a video is made of."""
         distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
+
+    def computes(self, **entries: str) -> list[str]:
+        """Keeps what computes the run's numbers beside the rest of its environment.
+
+        Returns:
+          A line per entry that is another one than when the run began.
+        """
+        path = self.path / rundir.ENVIRONMENT
+        return distributed.on_first(lambda: remember(path, entries))
 
     def write_json(self, name: str, data: Any) -> None:
         """Replaces a JSON file."""
@@ -269,11 +278,7 @@ def _describe(path: Path, config: dict[str, Any], differences: Differences) -> N
         rundir.write_json(there, config)
     elif config.get(_GOAL, 0) > began.get(_GOAL, 0):
         rundir.write_json(there, began | {_GOAL: config[_GOAL]})
-    if not (path / rundir.ENVIRONMENT).exists():
-        rundir.write_json(path / rundir.ENVIRONMENT, environment())
-        return
-    old = rundir.read_json(path / rundir.ENVIRONMENT)
-    for line in compare_environment(old, environment()):
+    for line in remember(path / rundir.ENVIRONMENT, environment()):
         distributed.say(f"warning: {line}")
 
 
