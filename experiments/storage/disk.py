@@ -69,10 +69,10 @@ def opened(path: Path, flags: int) -> Iterator[int]:
     flags |= os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     with storage_errors(f"write {path}"):
         file = os.open(path, flags, 0o666)
-        try:
-            yield file
-        finally:
-            os.close(file)
+    try:
+        yield file
+    finally:
+        os.close(file)
 
 
 def check_own(path: Path, *, folder: bool = False) -> None:

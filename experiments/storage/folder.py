@@ -5,6 +5,7 @@ reads or fails at gets to the others.
 """
 
 import contextlib
+import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,8 +25,8 @@ from experiments.storage import (
 )
 from experiments.storage.environment import compare_environment, environment
 
-# (of the start, of now) -> what differs between two configs in JSON.
-Differences = Callable[[Any, Any], list[str]]
+# (of the start, of now, where the first is) -> what differs between configs in JSON.
+Differences = Callable[[Any, Any, str], list[str]]
 
 
 class RunFolder(NamedTuple):
@@ -33,6 +34,8 @@ class RunFolder(NamedTuple):
 
     path: Path
     milestones: Sequence[int] = ()  # trials whose checkpoints are never dropped
+    # Of a config and where it was found: how it differs from that of this run.
+    differences: Callable[[Any, str], list[str]] = lambda config, where: []
 
     def say(self, text: str) -> None:
         """Prints a line for the user."""
@@ -159,7 +162,7 @@ class RunFolder(NamedTuple):
         def read() -> tuple[int, dict[str, Any]] | None:
             found = checkpoint.restore(
                 self._checkpoints, template, step=step, part=part,
-                warn=lambda line: self.say(f"warning: {line}"),
+                warn=lambda line: self.say(f"warning: {line}"), foreign=self._foreign,
             )  # fmt: skip
             if found is None:
                 return None
@@ -172,7 +175,20 @@ class RunFolder(NamedTuple):
         number, meta = found
         return number, _shared(kept[0] if kept else None, template), meta
 
+    def _foreign(self, meta: dict[str, Any]) -> str | None:
+        """Says why a checkpoint is not of this run; those of older versions are."""
+        own, found = rundir.read_id(self.path), meta.get("run")
+        if own is None or found is None:
+            return None
+        if found != own:
+            return f"of run {found!r}, not {own!r}"
+        lines = self.differences(meta["config"], "its config")
+        return f"of other numbers: {'; '.join(lines)}" if lines else None
+
     def _save(self, step: int, state: Any, meta: dict[str, Any], finite: Any) -> None:
+        if (own := rundir.read_id(self.path)) is not None:
+            config = rundir.find_json(self.path / rundir.CONFIG)
+            meta = {**meta, "run": own, "config": config}
         checkpoint.save(
             self._checkpoints, step, state, meta,
             finite=finite, milestones=self.milestones,
@@ -206,7 +222,13 @@ def open_run(
       CheckpointError: if the folder is in use or belongs to another config.
       StorageError: if it cannot be written to.
     """
-    run = RunFolder(path, tuple(config["milestones"]))
+
+    def differing(then: Any, where: str) -> list[str]:
+        # A run may have been given more trials since.
+        more = {name: config[name] for name in ("num_trials",) if name in config}
+        return differences({**then, **more}, config, where)
+
+    run = RunFolder(path, tuple(config["milestones"]), differing)
     held = _held(path, config, differences, needed_bytes)
     with distributed.held_by_first(held):
         yield run
@@ -237,9 +259,13 @@ def _held(
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Writes config and environment of a new run, compares those of an old one."""
-    if not (path / rundir.CONFIG).exists():
-        rundir.write_json(path / rundir.CONFIG, config)
-    elif lines := differences(rundir.read_json(path / rundir.CONFIG), config):
+    own = path / rundir.CONFIG
+    if not own.exists():
+        known = (path / rundir.IDENTITY).exists()
+        if not known and not checkpoint.steps(path / rundir.CHECKPOINTS):
+            rundir.write_json(path / rundir.IDENTITY, {"id": secrets.token_hex(8)})
+        rundir.write_json(own, config)
+    elif lines := differences(rundir.read_json(own), config, str(own)):
         another = "--name" if config["phase"] == "explore" else "--tag"
         raise CheckpointError(
             f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "

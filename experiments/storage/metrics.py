@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.errors import UsageError
+from experiments.errors import UsageError, storage_errors
 from experiments.storage import disk, rundir
 
 # Names in rows of older versions.
@@ -180,7 +180,7 @@ def cut_log(path: Path, last: int) -> None:
 
 
 def _orphans(path: Path) -> Path:
-    return path.with_name(path.name + ".orphan")
+    return path.with_name(rundir.ORPHANS)
 
 
 def _lines(rows: Sequence[Mapping[str, Any]]) -> bytes:
@@ -204,10 +204,11 @@ def _trials(path: Path) -> Iterator[tuple[bytes, int | None]]:
 def _append(path: Path, data: bytes) -> None:
     with disk.opened(path, os.O_RDWR | os.O_APPEND) as file:
         start = os.lseek(file, 0, os.SEEK_END)
-        try:
-            while data:
-                data = data[os.write(file, data) :]
-            os.fsync(file)
-        except OSError:
-            os.ftruncate(file, start)  # Half a row would spoil the next one.
-            raise
+        with storage_errors(f"write {path}"):
+            try:
+                while data:
+                    data = data[os.write(file, data) :]
+                os.fsync(file)
+            except OSError:
+                os.ftruncate(file, start)  # Half a row would spoil the next one.
+                raise

@@ -28,7 +28,9 @@ from experiments.storage.disk import free_bytes, megabytes
 CONFIG = "config.json"
 ENVIRONMENT = "env.json"
 STATUS = "status.json"
+IDENTITY = "run.json"
 METRICS = "metrics.jsonl"
+ORPHANS = f"{METRICS}.orphan"
 CHECKPOINTS = "checkpoints"
 TRAJECTORIES = "trajectories.npz"
 
@@ -57,31 +59,28 @@ def lock(run_dir: Path) -> Iterator[None]:
 
     Raises:
       CheckpointError: Another process holds it; the message says which.
-      StorageError: The directory cannot be made or locked.
+      StorageError: The directory cannot be made or locked, or is a link.
     """
-    path = run_dir / ".lock"
-    with storage_errors(f"lock {run_dir}"):
+    disk.check_own(run_dir, folder=True)
+    with storage_errors(f"make {run_dir}"):
         run_dir.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-    try:
-        with storage_errors(f"lock {run_dir}"):
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise CheckpointError(
-                    f"{run_dir} is in use by {_holder(file)}. Stop it or choose "
-                    "another run directory."
-                ) from None
-            owner = {
-                "pid": os.getpid(),
-                "host": socket.gethostname(),
-                "start": time.strftime("%Y-%m-%d %H:%M:%S"),
-            }
-            os.ftruncate(file, 0)
-            os.pwrite(file, json.dumps(owner).encode(), 0)
+    # Never unlinked: a waiting process may have it open already.
+    with disk.opened(run_dir / ".lock", os.O_RDWR) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CheckpointError(
+                f"{run_dir} is in use by {_holder(file)}. Stop it or choose another "
+                "run directory."
+            ) from None
+        owner = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "start": time.strftime("%Y-%m-%d %H:%M:%S"),
+        }
+        os.ftruncate(file, 0)
+        os.pwrite(file, json.dumps(owner).encode(), 0)
         yield
-    finally:
-        os.close(file)  # Never unlinked: a waiting process may have it open already.
 
 
 def _holder(file: int) -> str:
@@ -97,11 +96,15 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
     """Makes a run directory, and writes and reads there before anything is compiled.
 
     Raises:
-      StorageError: It cannot be written, or has less than `needed_bytes` free.
+      StorageError: It cannot be written, a link leads out of it, or it has less than
+        `needed_bytes` free.
     """
     data = os.urandom(4096)
     with storage_errors(f"write in {run_dir}"):
         run_dir.mkdir(parents=True, exist_ok=True)
+        disk.check_own(run_dir / CHECKPOINTS, folder=True)
+        for name in (METRICS, ORPHANS):
+            disk.check_own(run_dir / name)
         with disk.draft(run_dir / ".probe") as probe:
             probe.write_bytes(data)
             disk.sync(probe)
@@ -113,6 +116,21 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
             f"no space in {run_dir} (a run needs {megabytes(needed_bytes)}, "
             f"{megabytes(free)} free). Free space or choose another run directory."
         )
+
+
+def read_id(run_dir: Path) -> str | None:
+    """Returns the id of a run, None if an older version has made it.
+
+    Raises:
+      CheckpointError: It cannot be read.
+    """
+    path = run_dir / IDENTITY
+    if not os.path.lexists(path):
+        return None
+    found = read_json(path)
+    if not isinstance(found, dict) or not isinstance(found.get("id"), str):
+        raise CheckpointError(f"{path} holds no id of a run. Restore or remove it.")
+    return found["id"]
 
 
 def write_json(path: Path, data: Any) -> None:

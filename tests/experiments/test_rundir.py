@@ -111,7 +111,12 @@ def test_a_lock_with_unreadable_owner(tmp_path):
 def test_a_lock_is_never_followed_elsewhere(tmp_path):
     (tmp_path / "precious").write_text("data")
     (tmp_path / ".lock").symlink_to("precious")
-    with pytest.raises(StorageError, match="cannot lock"), rundir.lock(tmp_path):
+    words = r"\.lock is a link, or no file; a run writes to its own only"
+    with pytest.raises(StorageError, match=words), rundir.lock(tmp_path):
+        raise AssertionError("took a link for a lock")
+    (tmp_path / ".lock").unlink()
+    (tmp_path / ".lock").hardlink_to(tmp_path / "precious")
+    with pytest.raises(StorageError, match=words), rundir.lock(tmp_path):
         raise AssertionError("took a link for a lock")
     assert (tmp_path / "precious").read_text() == "data"
 
