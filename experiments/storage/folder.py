@@ -5,28 +5,26 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.errors import CheckpointError, InterruptedRun, RunError
+from experiments.errors import InterruptedRun, RunError
 from experiments.parallel import distributed
 from experiments.storage import (
     checkpoint,
     disk,
+    identity,
     metrics,
     pytrees,
     rundir,
     trajectories,
 )
 from experiments.storage.environment import compare_environment, environment
-
-# (of the start, of now, where the first is) -> what differs between configs in JSON.
-Differences = Callable[[Any, Any, str], list[str]]
+from experiments.storage.identity import Differences
 
 
 class RunFolder(NamedTuple):
@@ -34,8 +32,9 @@ class RunFolder(NamedTuple):
 
     path: Path
     milestones: Sequence[int] = ()  # trials whose checkpoints are never dropped
-    # Of a config and where it was found: how it differs from that of this run.
-    differences: Callable[[Any, str], list[str]] = lambda config, where: []
+    # Of a run that is written to:
+    started: Mapping[str, Any] | None = None  # its config
+    differences: Differences = lambda then, now, where: []
 
     def say(self, text: str) -> None:
         """Prints a line for the user."""
@@ -176,21 +175,11 @@ class RunFolder(NamedTuple):
         return number, _shared(kept[0] if kept else None, template), meta
 
     def _foreign(self, meta: dict[str, Any]) -> str | None:
-        """Says why a checkpoint is not of this run; those of older versions are."""
-        own, found = rundir.read_id(self.path), meta.get("run")
-        if own is None or found is None:
-            return None
-        if found != own:
-            return f"of run {found!r}, not {own!r}"
-        lines = self.differences(meta["config"], "its config")
-        return f"of other numbers: {'; '.join(lines)}" if lines else None
+        return identity.foreign(self.path, meta, self.started, self.differences)
 
     def _save(self, step: int, state: Any, meta: dict[str, Any], finite: Any) -> None:
-        if (own := rundir.read_id(self.path)) is not None:
-            config = rundir.find_json(self.path / rundir.CONFIG)
-            meta = {**meta, "run": own, "config": config}
         checkpoint.save(
-            self._checkpoints, step, state, meta,
+            self._checkpoints, step, state, meta | identity.of(self.path),
             finite=finite, milestones=self.milestones,
         )  # fmt: skip
 
@@ -222,13 +211,7 @@ def open_run(
       CheckpointError: if the folder is in use or belongs to another config.
       StorageError: if it cannot be written to.
     """
-
-    def differing(then: Any, where: str) -> list[str]:
-        # A run may have been given more trials since.
-        more = {name: config[name] for name in ("num_trials",) if name in config}
-        return differences({**then, **more}, config, where)
-
-    run = RunFolder(path, tuple(config["milestones"]), differing)
+    run = RunFolder(path, tuple(config["milestones"]), config, differences)
     held = _held(path, config, differences, needed_bytes)
     with distributed.held_by_first(held):
         yield run
@@ -259,18 +242,7 @@ def _held(
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Writes config and environment of a new run, compares those of an old one."""
-    own = path / rundir.CONFIG
-    if not own.exists():
-        known = (path / rundir.IDENTITY).exists()
-        if not known and not checkpoint.steps(path / rundir.CHECKPOINTS):
-            rundir.write_json(path / rundir.IDENTITY, {"id": secrets.token_hex(8)})
-        rundir.write_json(own, config)
-    elif lines := differences(rundir.read_json(own), config, str(own)):
-        another = "--name" if config["phase"] == "explore" else "--tag"
-        raise CheckpointError(
-            f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "
-            f"flags, or another {another}."
-        )
+    identity.settle(path, config, differences)
     if not (path / rundir.ENVIRONMENT).exists():
         rundir.write_json(path / rundir.ENVIRONMENT, environment())
         return

@@ -9,6 +9,7 @@ import os
 import re
 import socket
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -118,29 +119,14 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
         )
 
 
-def read_id(run_dir: Path) -> str | None:
-    """Returns the id of a run, None if an older version has made it.
-
-    Raises:
-      CheckpointError: It cannot be read.
-    """
-    path = run_dir / IDENTITY
-    if not os.path.lexists(path):
-        return None
-    found = read_json(path)
-    if not isinstance(found, dict) or not isinstance(found.get("id"), str):
-        raise CheckpointError(f"{path} holds no id of a run. Restore or remove it.")
-    return found["id"]
-
-
 def write_json(path: Path, data: Any) -> None:
     """Replaces a JSON file at once; a reader sees the old file or the new one."""
     text = json.dumps(plain(data), indent=2, allow_nan=False) + "\n"
     disk.write(path, text.encode())
 
 
-def read_json(path: Path) -> Any:
-    """Reads a JSON file of a run.
+def read_json(path: Path, limit: int = _MAX_JSON_BYTES) -> Any:
+    """Reads a JSON file of a run of at most `limit` bytes.
 
     Raises:
       CheckpointError: It is missing, too large or not JSON; the message says where.
@@ -149,13 +135,15 @@ def read_json(path: Path) -> Any:
         raise CheckpointError(f"{path} does not exist or is not a file.")
     try:
         with path.open("rb") as file:
-            data = file.read(_MAX_JSON_BYTES + 1)
-        if len(data) > _MAX_JSON_BYTES:
+            data = file.read(limit + 1)
+        if len(data) > limit:
             raise CheckpointError(
-                f"{path} is larger than {megabytes(_MAX_JSON_BYTES)}. It is not a file "
-                "of a run."
+                f"{path} is larger than {megabytes(limit)}. It is not a file of a run."
             )
-        return json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+        text = data.decode("utf-8")
+        return json.loads(
+            text, parse_constant=_refuse_constant, object_pairs_hook=_object
+        )
     except json.JSONDecodeError as error:
         why = f"{error.msg}, line {error.lineno}, column {error.colno}"
     except (UnicodeDecodeError, ValueError, RecursionError, OSError) as error:
@@ -166,14 +154,21 @@ def read_json(path: Path) -> Any:
 def find_json(path: Path) -> dict[str, Any]:
     """Returns the object in a file, or an empty one if there is none to read."""
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
+        found = read_json(path, 100 * _MAX_JSON_BYTES)
+    except CheckpointError:
         return {}
     return found if isinstance(found, dict) else {}
 
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    (name, count), *_ = Counter(name for name, _ in pairs).most_common(1) or [("", 1)]
+    if count > 1:
+        raise ValueError(f"{name!r} is there twice")
+    return dict(pairs)
 
 
 def plain(value: Any) -> Any:

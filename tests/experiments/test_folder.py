@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.errors import CheckpointError, InterruptedRun, StorageError
-from experiments.storage import checkpoint, folder, metrics, rundir
+from experiments.storage import checkpoint, folder, identity, metrics, rundir
 from experiments.storage.folder import RunFolder
 
 FLIPPED = b'{"trial": 1}\n{"tri\xe1l": 2}\n{"trial": 3}\n'
@@ -243,7 +243,7 @@ def test_a_checkpoint_of_another_run_is_not_used(tmp_path, capsys):
     log = (own / rundir.METRICS).read_bytes()
     moved(other, own, 2)
     assert resumed(own) == 1
-    a, b = (rundir.read_id(run) for run in (own, other))
+    a, b = (identity.read_id(run) for run in (own, other))
     assert capsys.readouterr().err == (
         f"warning: checkpoint 2 is foreign (of run {b!r}, not {a!r}); moved to "
         ".foreign-2, using 1.\n"

@@ -172,6 +172,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         (b"", "Expecting value, line 1, column 1"),
         (b'{"a": 1,\n "b" 2}', "line 2, column 6"),
         (b'{"a": NaN}', "NaN is not JSON"),
+        (b'{"a": 1, "b": {"c": 1, "d": 2, "c": 3}}', "'c' is there twice"),
+        (b'{"\\u001b[2J": 1, "\\u001b[2J": 3}', r"'\\x1b\[2J' is there twice"),
         (b"\xff\xfe\x00", "utf-8"),
         (b"[" * 100_000, "recursion"),
         (b'"' + b"x" * 2_000_000 + b'"', "larger than 1 MB"),
