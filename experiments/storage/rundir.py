@@ -6,15 +6,15 @@ import fcntl
 import json
 import math
 import os
-import re
 import socket
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
+import msgspec
 import numpy as np
 
 from experiments.errors import (
@@ -35,7 +35,8 @@ ORPHANS = f"{METRICS}.orphan"
 CHECKPOINTS = "checkpoints"
 TRAJECTORIES = "trajectories.npz"
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+# What can only be one file or folder below another.
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 _MAX_JSON_BYTES = 1_000_000
 
 
@@ -46,12 +47,14 @@ def now() -> str:
 
 def check_name(name: str) -> None:
     """Raises UsageError unless `name` can only be one folder below the output."""
-    if not _NAME.fullmatch(name):
+    try:
+        msgspec.convert(name, Name)
+    except msgspec.ValidationError:
         shown = name if len(name) <= 64 else name[:61] + "..."
         raise UsageError(
             f"run {shown!r} is not a valid name (use letters, digits, '.', '_', '-', "
             "at most 64, starting with a letter or digit)."
-        )
+        ) from None
 
 
 @contextlib.contextmanager
