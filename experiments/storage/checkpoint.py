@@ -85,7 +85,7 @@ def save(
     size = 200_000 + sum(x.nbytes for x in arrays.values())  # orbax compresses them
     kept = [policies.LatestN(keep), policies.CustomSteps(list(milestones))]
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        disk.make(directory)
         step_folders.sweep(directory)
         if disk.free_bytes(directory) < size:
             # Orbax would find out too, after pages of its threads' tracebacks.

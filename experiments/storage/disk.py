@@ -101,6 +101,14 @@ def check_own(path: Path, *, folder: bool = False) -> None:
         )
 
 
+def make(folder: Path) -> None:
+    """Makes a folder, and those that it is in; a power cut does not undo it."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync(path.parent)
+
+
 def sync(path: Path) -> None:
     """Forces a file, or the names in a directory, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)

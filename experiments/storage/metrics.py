@@ -238,6 +238,8 @@ def _append(path: Path, data: bytes) -> None:
                 while data:
                     data = data[os.write(file, data) :]
                 os.fsync(file)
+                if not start:
+                    disk.sync(path.parent)
             except OSError:
                 os.ftruncate(file, start)  # Half a row would spoil the next one.
                 raise

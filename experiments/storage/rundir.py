@@ -67,7 +67,7 @@ def lock(run_dir: Path) -> Iterator[None]:
     """
     disk.check_own(run_dir, folder=True)
     with storage_errors(f"make {run_dir}"):
-        run_dir.mkdir(parents=True, exist_ok=True)
+        disk.make(run_dir)
     # Never unlinked: a waiting process may have it open already.
     with disk.opened(run_dir / ".lock", os.O_RDWR) as file:
         try:
@@ -105,7 +105,7 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
     """
     data = os.urandom(4096)
     with storage_errors(f"write in {run_dir}"):
-        run_dir.mkdir(parents=True, exist_ok=True)
+        disk.make(run_dir)
         disk.check_own(run_dir / CHECKPOINTS, folder=True)
         for name in (METRICS, ORPHANS):
             disk.check_own(run_dir / name)
