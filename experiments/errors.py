@@ -4,10 +4,22 @@ import contextlib
 from collections.abc import Iterator
 
 
+def printable(text: str) -> str:
+    """Returns lines that a terminal shows as they are: it obeys nothing in them.
+
+    A name or a text from the folder of a stranger may hold control characters.
+    """
+    safe = (x if x == "\n" or x.isprintable() else ascii(x)[1:-1] for x in text)
+    return "".join(safe)
+
+
 class RunError(Exception):
     """A failure that is not a bug; its message is one line for the user."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return printable(super().__str__()).replace("\n", "\\n")
 
 
 class UsageError(RunError):

@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -253,9 +254,9 @@ def test_orbax_has_one_home():
     assert found == ORBAX
 
 
-# Who may write a file where it stands: the writer itself, the log, which is appended
-# to, the lock and the probe, and the seal of a checkpoint that is still a draft.
-WRITERS = {"storage.disk", "storage.metrics", "storage.rundir", "storage.step_folders"}
+# Who may write a file where it stands: the writer itself, which also opens what is
+# appended to, and the seal of a checkpoint that is still a draft.
+WRITERS = {"storage.disk", "storage.step_folders"}
 WRITING = {
     "write_text", "write_bytes", "savez", "savez_compressed", "savefig", "copy",
     "copy2", "copyfile", "write_frames",
@@ -263,11 +264,13 @@ WRITING = {
 
 
 def writes(tree):
-    """Returns the calls that write a file which no `disk.replaced` has given."""
+    """Returns the calls that write a file which is no draft."""
     found, drafts = [], {"target"}  # a target is what a caller has given
     for node in ast.walk(tree):
         match node:
-            case ast.withitem(ast.Call(ast.Attribute(attr="replaced")), ast.Name(id)):
+            case ast.withitem(
+                ast.Call(ast.Attribute(attr="replaced" | "draft")), ast.Name(id)
+            ):
                 drafts.add(id)
             case _:
                 pass
@@ -277,7 +280,7 @@ def writes(tree):
         mode = any(set(str(word)) & set("wax+") for word in words)
         if name in WRITING or (name == "open" and mode):
             text = ast.unparse(call)
-            if not any(f"({draft}" in text.replace("str(", "(") for draft in drafts):
+            if not drafts & set(re.findall(r"\w+", text)):
                 found.append(text)
     return found
 

@@ -37,7 +37,7 @@ class ProcessSpec(NamedTuple):
 def say(text: str) -> None:
     """Prints a line for the user, once for all processes."""
     if is_first():
-        print(text, file=sys.stderr, flush=True)
+        print(errors.printable(text), file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -69,10 +69,10 @@ def opened(path: Path, flags: int) -> Iterator[int]:
     flags |= os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     with storage_errors(f"write {path}"):
         file = os.open(path, flags, 0o666)
-        try:
-            yield file
-        finally:
-            os.close(file)
+    try:
+        yield file
+    finally:
+        os.close(file)
 
 
 def check_own(path: Path, *, folder: bool = False) -> None:
@@ -99,6 +99,14 @@ def check_own(path: Path, *, folder: bool = False) -> None:
             f"{path} is a link, or no {kind}; a run writes to its own only. Put a copy "
             "of what it stands for in its place, or move it away."
         )
+
+
+def make(folder: Path) -> None:
+    """Makes a folder, and those that it is in; a power cut does not undo it."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync(path.parent)
 
 
 def sync(path: Path) -> None:

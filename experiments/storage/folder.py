@@ -5,7 +5,7 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import errors
-from experiments.errors import CheckpointError, InterruptedRun, StorageError
+from experiments.errors import InterruptedRun, StorageError
 from experiments.parallel import distributed
 from experiments.storage import (
     checkpoint,
     disk,
+    identity,
     metrics,
     pytrees,
     rundir,
@@ -25,11 +26,8 @@ from experiments.storage import (
     trajectories,
 )
 from experiments.storage.environment import environment, remember
+from experiments.storage.identity import Differences
 from experiments.storage.status import Writer
-
-# (of the start, of now) -> what differs between two configs in JSON.
-Differences = Callable[[Any, Any], list[str]]
-_GOAL = "num_trials"  # of a config: the trial that completes a run may come later
 
 
 class RunFolder(NamedTuple):
@@ -37,7 +35,10 @@ class RunFolder(NamedTuple):
 
     path: Path
     milestones: Sequence[int] = ()  # trials whose checkpoints are never dropped
-    status: Writer | None = None  # of a run that this process writes to
+    # Of a run that is written to:
+    started: Mapping[str, Any] | None = None  # its config
+    differences: Differences = lambda then, now, where: []
+    status: Writer | None = None  # on process 0
 
     def say(self, text: str) -> None:
         """Prints lines for the user; the last one gets into status.json."""
@@ -188,7 +189,7 @@ class RunFolder(NamedTuple):
         def read() -> tuple[int, dict[str, Any], dict[str, Any]] | None:
             found = checkpoint.restore(
                 self._checkpoints, template, step=step, part=part,
-                warn=lambda line: self.say(f"warning: {line}"),
+                warn=lambda line: self.say(f"warning: {line}"), foreign=self._foreign,
             )  # fmt: skip
             if found is None:
                 return None
@@ -202,9 +203,12 @@ class RunFolder(NamedTuple):
         like = template(leaves) if callable(template) else template
         return number, _shared(kept[0] if kept else None, like), meta
 
+    def _foreign(self, meta: dict[str, Any]) -> str | None:
+        return identity.foreign(self.path, meta, self.started, self.differences)
+
     def _save(self, step: int, state: Any, meta: dict[str, Any], finite: Any) -> None:
         checkpoint.save(
-            self._checkpoints, step, state, meta,
+            self._checkpoints, step, state, meta | identity.of(self.path),
             finite=finite, milestones=self.milestones,
         )  # fmt: skip
 
@@ -240,7 +244,7 @@ def open_run(
     held = _held(path, config, differences, needed_bytes, writer)
     with distributed.held_by_first(held):
         own = writer if distributed.is_first() else None
-        yield RunFolder(path, tuple(config["milestones"]), own)
+        yield RunFolder(path, tuple(config["milestones"]), config, differences, own)
 
 
 @contextlib.contextmanager
@@ -266,18 +270,7 @@ def _held(
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Writes config and environment of a new run, compares those of an old one."""
-    there = path / rundir.CONFIG
-    began = rundir.read_json(there) if there.exists() else config
-    if lines := differences(began, config):
-        another = "--name" if config["phase"] == "explore" else "--tag"
-        raise CheckpointError(
-            f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "
-            f"flags, or another {another}."
-        )
-    if not there.exists():
-        rundir.write_json(there, config)
-    elif config.get(_GOAL, 0) > began.get(_GOAL, 0):
-        rundir.write_json(there, began | {_GOAL: config[_GOAL]})
+    identity.settle(path, config, differences)
     for line in remember(path / rundir.ENVIRONMENT, environment()):
         distributed.say(f"warning: {line}")
 

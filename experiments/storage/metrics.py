@@ -21,7 +21,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.errors import UsageError
+import msgspec
+
+from experiments.errors import storage_errors
+from experiments.parallel import distributed
 from experiments.storage import disk, rundir
 
 # Names in rows of older versions.
@@ -66,37 +69,63 @@ def number(value: Any) -> float:
     return float("nan") if value is None else float(value)
 
 
+class _Line(msgspec.Struct, kw_only=True, tag_field="phase"):
+    """What a row must have, and of what kind it is; older versions wrote less."""
+
+    arm: rundir.Name
+    seed: int
+    trial: int
+    value: float | None = None
+    turns: float | None = None
+    returns: dict[str, float | None] | None = None
+    fit: dict[str, float | None] | None = None
+    seconds: dict[str, float | None] | None = None
+
+
+class _Explore(_Line, tag="explore"):
+    pass
+
+
+class _ZeroShot(_Line, tag="zero-shot"):
+    task: str
+    explored_trials: int
+    own: float | None = msgspec.field(name="return")
+
+
+class _Finetune(_ZeroShot, tag="finetune"):
+    pass
+
+
 def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
     """Yields the rows of a log of a run with this config, in JSON.
 
     A last line without its end is left out: a run is writing it, or was killed while it
-    did.
-
-    Raises:
-      UsageError: for a line that is no row.
+    did. So is a line that is no row, and that is said.
     """
-    for i, line in enumerate(log.read_text().splitlines(keepends=True), 1):
-        if not line.endswith("\n"):
-            return
-        try:
-            yield _parsed(json.loads(line), config, log.parent)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UsageError(f"{log}:{i} is no row of a run ({error!r}).") from error
+    with log.open("rb") as file:
+        for i, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                return
+            try:
+                yield _parsed(json.loads(line), config, log.parent)
+            except (ValueError, RecursionError) as error:
+                why = f"{log}:{i} is no row of a run ({error})"
+                distributed.say(f"warning: {why}; left out.")
 
 
-def _parsed(data: dict[str, Any], config: Mapping[str, Any], run: Path) -> Row:
-    exploring = data["phase"] == "explore"
+def _parsed(data: Any, config: Mapping[str, Any], run: Path) -> Row:
+    line = msgspec.convert(data, _Explore | _ZeroShot | _Finetune)
     if fit := data.get("fit"):
         fit = {_RENAMED.get(name, name): value for name, value in fit.items()}
         data = data | {"fit": fit}
     return Row(
         preset=config["preset"],
-        arm=arm_label(data["arm"], config),
+        arm=arm_label(line.arm, config),
         phase=data["phase"],
-        seed=int(data["seed"]),
-        task="" if exploring else data["task"],
-        trial=int(data["trial"]),
-        explored=0 if exploring else int(data["explored_trials"]),
+        seed=line.seed,
+        task="" if isinstance(line, _Explore) else line.task,
+        trial=line.trial,
+        explored=0 if isinstance(line, _Explore) else line.explored_trials,
         tag=config.get("tag") or "",
         data=data,
         run=run,
@@ -180,7 +209,7 @@ def cut_log(path: Path, last: int) -> None:
 
 
 def _orphans(path: Path) -> Path:
-    return path.with_name(path.name + ".orphan")
+    return path.with_name(rundir.ORPHANS)
 
 
 def _lines(rows: Sequence[Mapping[str, Any]]) -> bytes:
@@ -204,10 +233,13 @@ def _trials(path: Path) -> Iterator[tuple[bytes, int | None]]:
 def _append(path: Path, data: bytes) -> None:
     with disk.opened(path, os.O_RDWR | os.O_APPEND) as file:
         start = os.lseek(file, 0, os.SEEK_END)
-        try:
-            while data:
-                data = data[os.write(file, data) :]
-            os.fsync(file)
-        except OSError:
-            os.ftruncate(file, start)  # Half a row would spoil the next one.
-            raise
+        with storage_errors(f"write {path}"):
+            try:
+                while data:
+                    data = data[os.write(file, data) :]
+                os.fsync(file)
+                if not start:
+                    disk.sync(path.parent)
+            except OSError:
+                os.ftruncate(file, start)  # Half a row would spoil the next one.
+                raise

@@ -67,7 +67,10 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     """
     if num_rows < 1:
         raise UsageError(f"--rows {num_rows} is not valid; it must be 1 or more.")
-    configs = [from_json(RunFolder(run).config(), PRESETS["smoke"]) for run in runs]
+    configs = [
+        from_json(RunFolder(run).config(), PRESETS["smoke"], str(run / rundir.CONFIG))
+        for run in runs
+    ]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
     # The random trials of a seed are the same in all arms: all models know them.

@@ -42,7 +42,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
     plain = RunFolder(run).config()
-    config = from_json(plain, PRESETS["smoke"])
+    config = from_json(plain, PRESETS["smoke"], str(run / rundir.CONFIG))
     seed = config.seeds[0] if seed is None else seed
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))

@@ -170,6 +170,18 @@ def test_a_run_gives_its_numbers_and_nothing_else(out, tmp_path):
     )
 
 
+def test_a_later_phase_follows_no_link_out_of_the_run(fail, out, tmp_path):
+    run, outside = explored(out).parent, tmp_path / "outside"
+    step = run / "checkpoints" / "3"
+    step.mkdir(parents=True)
+    (step / "SHA256SUMS").touch()
+    outside.mkdir()
+    (run / "zero-shot-003").symlink_to(outside)
+    code, line = fail(*LATER)
+    assert code == 5 and f"{run / 'zero-shot-003'} is a link, or no folder" in line
+    assert list(outside.iterdir()) == []
+
+
 def test_from_names_a_run_anywhere(out):
     path = explored(out, name="mine", arm="count", num_bits=16)
     config = cli.parse(["--phase", "finetune", "--from", str(path.parent)])

@@ -37,6 +37,15 @@ def test_what_a_disk_refuses_is_one_line(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def test_a_new_folder_is_on_the_disk(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(disk, "sync", synced.append)
+    disk.make(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir() and set(synced) == {tmp_path, tmp_path / "a"}
+    disk.make(tmp_path / "a" / "b")
+    assert len(synced) == 2
+
+
 def test_drafts_of_the_killed_are_swept(tmp_path):
     (tmp_path / ".tmp-0badcafe.npz").write_text("half")
     (tmp_path / "a").write_text("whole")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.errors import CheckpointError, InterruptedRun, StorageError
-from experiments.storage import checkpoint, folder, metrics, rundir
+from experiments.storage import checkpoint, folder, identity, metrics, rundir
 from experiments.storage.folder import RunFolder
 
 FLIPPED = b'{"trial": 1}\n{"tri\xe1l": 2}\n{"trial": 3}\n'
@@ -29,7 +29,8 @@ def trials(run):
     return [json.loads(line)["trial"] for line in lines]
 
 
-def differences(old, new):
+def differences(old, new, where):
+    del where
     return [f"seeds: {old['seeds']}"] if old["seeds"] != new["seeds"] else []
 
 
@@ -264,3 +265,118 @@ def test_another_environment_is_said(tmp_path, capsys):
     err = capsys.readouterr().err
     assert err.startswith("warning: numpy was 0.1 and is now ")
     assert err.count("\n") == 1
+
+
+# A checkpoint knows its run.
+
+
+def recorded(path, config=CONFIG):
+    """Returns the folder of a run with two checkpoints."""
+    with opened(path, config) as run:
+        record(run, 1)
+        record(run, 2)
+    return path
+
+
+def moved(source, target, step):
+    """Puts a step of one run into another."""
+    there = target / rundir.CHECKPOINTS / str(step)
+    shutil.rmtree(there, ignore_errors=True)
+    shutil.copytree(source / rundir.CHECKPOINTS / str(step), there)
+
+
+def resumed(path, config=CONFIG):
+    with opened(path, config) as run:
+        found = run.resume(state(0))
+        return found and found[0]
+
+
+def test_a_checkpoint_of_another_run_is_not_used(tmp_path, capsys):
+    own, other = recorded(tmp_path / "a"), recorded(tmp_path / "b")
+    log = (own / rundir.METRICS).read_bytes()
+    moved(other, own, 2)
+    assert resumed(own) == 1
+    a, b = (identity.read_id(run) for run in (own, other))
+    assert capsys.readouterr().err == (
+        f"warning: checkpoint 2 is foreign (of run {b!r}, not {a!r}); moved to "
+        ".foreign-2, using 1.\n"
+    )
+    assert (own / rundir.METRICS).read_bytes() == log.splitlines(keepends=True)[0]
+    moved(other, own, 1)
+    with pytest.raises(CheckpointError, match=r"no checkpoint in .*\(1 is foreign: of"):
+        resumed(own)
+    # Whoever only reads is told too.
+    with pytest.raises(CheckpointError, match=r"checkpoint 1 in .* is foreign"):
+        RunFolder(own).restore_trial(1, state(0))
+
+
+def test_a_checkpoint_of_other_numbers_is_not_used(tmp_path, capsys):
+    """As when a config is lost, and the flags are others then."""
+    config = CONFIG | {"num_trials": 2}
+    path = recorded(tmp_path / "a", config)
+    assert resumed(path, config | {"num_trials": 3}) == 2  # it may have more
+    (path / rundir.CONFIG).unlink()
+    with pytest.raises(CheckpointError, match=r"2 is foreign: of other numbers: seeds"):
+        resumed(path, config | {"seeds": [1]})
+    (path / rundir.CONFIG).unlink()
+    assert resumed(path, config) == 2 and capsys.readouterr().err == ""
+
+
+def test_a_run_of_an_older_version_goes_on(tmp_path, capsys):
+    """Neither its folder nor its checkpoints have an id."""
+    path = recorded(tmp_path / "a")
+    (path / rundir.IDENTITY).unlink()
+    (path / rundir.CONFIG).unlink()
+    with opened(path) as run:
+        assert not (path / rundir.IDENTITY).exists()
+        record(run, 3)
+    assert resumed(path) == 3
+    rundir.write_json(path / rundir.IDENTITY, {"id": "mine"})
+    assert resumed(path) == 3 and capsys.readouterr().err == ""
+    (path / rundir.IDENTITY).write_text("[]")
+    with pytest.raises(CheckpointError, match=r"run\.json holds no id of a run\. Rest"):
+        resumed(path)
+
+
+# Nothing is written elsewhere.
+
+
+@pytest.mark.parametrize(
+    "name", ["a", rundir.CHECKPOINTS, rundir.METRICS, rundir.ORPHANS]
+)
+@pytest.mark.parametrize("kind", ["link", "other"])
+def test_a_folder_that_leads_elsewhere_is_refused(tmp_path, name, kind):
+    outside, path = tmp_path / "outside", tmp_path / "a"
+    outside.mkdir()
+    (outside / "precious").write_text("data")
+    place = path if name == "a" else path / name
+    place.parent.mkdir(exist_ok=True)
+    folder_ = name in ("a", rundir.CHECKPOINTS)
+    if kind == "link":
+        place.symlink_to(outside if folder_ else outside / "precious")
+    elif folder_:
+        place.write_text("a file")
+    else:
+        place.hardlink_to(outside / "precious")
+    before = place.lstat()
+    words = f"{place} is a link, or no {'folder' if folder_ else 'file'}; a run writes"
+    with pytest.raises(StorageError, match=words), opened(path):
+        raise AssertionError("it leads elsewhere")
+    assert place.lstat() == before
+    assert [x.name for x in outside.iterdir()] == ["precious"]
+    assert (outside / "precious").read_text() == "data"
+
+
+@pytest.mark.parametrize(
+    "name", [rundir.STATUS, rundir.ENVIRONMENT, rundir.TRAJECTORIES]
+)
+def test_a_link_in_a_files_place_is_replaced(tmp_path, name):
+    path, precious = tmp_path / "a", tmp_path / "precious"
+    path.mkdir()
+    precious.write_text("{}")
+    (path / name).symlink_to(precious)
+    with opened(path) as run:
+        if not run.has_trajectories():
+            run.save_trajectories({"obs": np.arange(3)})
+    assert precious.read_text() == "{}"
+    assert not (path / name).is_symlink()

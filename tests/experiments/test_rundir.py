@@ -111,7 +111,12 @@ def test_a_lock_with_unreadable_owner(tmp_path):
 def test_a_lock_is_never_followed_elsewhere(tmp_path):
     (tmp_path / "precious").write_text("data")
     (tmp_path / ".lock").symlink_to("precious")
-    with pytest.raises(StorageError, match="cannot lock"), rundir.lock(tmp_path):
+    words = r"\.lock is a link, or no file; a run writes to its own only"
+    with pytest.raises(StorageError, match=words), rundir.lock(tmp_path):
+        raise AssertionError("took a link for a lock")
+    (tmp_path / ".lock").unlink()
+    (tmp_path / ".lock").hardlink_to(tmp_path / "precious")
+    with pytest.raises(StorageError, match=words), rundir.lock(tmp_path):
         raise AssertionError("took a link for a lock")
     assert (tmp_path / "precious").read_text() == "data"
 
@@ -167,6 +172,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         (b"", "Expecting value, line 1, column 1"),
         (b'{"a": 1,\n "b" 2}', "line 2, column 6"),
         (b'{"a": NaN}', "NaN is not JSON"),
+        (b'{"a": 1, "b": {"c": 1, "d": 2, "c": 3}}', "'c' is there twice"),
+        (b'{"\\u001b[2J": 1, "\\u001b[2J": 3}', r"'\\x1b\[2J' is there twice"),
         (b"\xff\xfe\x00", "utf-8"),
         (b"[" * 100_000, "recursion"),
         (b'"' + b"x" * 2_000_000 + b'"', "larger than 1 MB"),
