@@ -150,6 +150,8 @@ def from_json(data: Any, default: Config, where: str = "config.json") -> Config:
 def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
     """Returns where two configs in JSON are not of the same run: `entry: old vs new`.
 
+    Which trial completes it may change.
+
     An entry that `old` lacks, because an older version wrote it, was what is now the
     default. A group of entries that it lacks cannot differ. `where` is what an error
     calls the file of `old`.
@@ -164,7 +166,11 @@ def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
         if dataclasses.is_dataclass(hint) and name not in old
     }
     then = dataclasses.replace(then, **unsaid)
-    pairs = {entry.name: (entry.of(then), entry.of(now)) for entry in entries(Run)}
+    pairs = {
+        entry.name: (entry.of(then), entry.of(now))
+        for entry in entries(Run)
+        if Mark.GOAL not in entry.marks
+    }
     return [
         f"{name}: {to_json(pair[0])} (there) vs {to_json(pair[1])} (now)"
         for name, pair in sorted(pairs.items())

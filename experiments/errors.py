@@ -58,6 +58,28 @@ class InterruptedRun(RunError):
     exit_code = 75
 
 
+class StoppedTogether(InterruptedRun):
+    """A signal that all processes know of, and stop for at the same point."""
+
+
+def last_line(error: RunError) -> str:
+    """Returns what the user is told of the end of a run."""
+    if isinstance(error, InterruptedRun):
+        return (
+            f"stopped: {error}; at most the trial under way is lost. Continue with the "
+            "same command."
+        )
+    return f"error: {error}"
+
+
+def reason(error: BaseException) -> str:
+    """Returns in one line why a run ended."""
+    if isinstance(error, RunError):
+        return str(error)
+    line, *_ = [*str(error).splitlines(), ""]
+    return f"{type(error).__name__}: {line}".rstrip(": ")
+
+
 @contextlib.contextmanager
 def storage_errors(doing: str) -> Iterator[None]:
     """Turns an OSError into a StorageError: `cannot <doing> (<reason>). ...`."""

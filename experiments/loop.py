@@ -50,8 +50,18 @@ class Phase(Protocol):
         ...
 
 
-def run(folder: RunFolder, phase: Phase, init: State, first: int, last: int) -> bool:
-    """Runs trials `first + 1` to `last`, or what is left of them; saves after each.
+def run(
+    folder: RunFolder, phase: Phase, state: State, first: int, done: int, last: int
+) -> bool:
+    """Runs what is left of the trials `first + 1` to `last`; saves after each.
+
+    Args:
+      folder: of the run.
+      phase: what to do.
+      state: of the learners after trial `done`.
+      first: the trial before the first of this run.
+      done: the last one that is saved, `first` if none is.
+      last: the one that completes the run.
 
     Returns:
       Whether anything was left.
@@ -63,7 +73,6 @@ def run(folder: RunFolder, phase: Phase, init: State, first: int, last: int) -> 
     def collect(tree: Any) -> Any:
         return devices.collect(phase.placement, tree, *phase.axes)
 
-    done, state = folder.resume(init, first) or (first, init)
     if done >= last:
         folder.say(f"already complete: {last - first} of {last - first} trials.")
         return False
@@ -85,7 +94,13 @@ def run(folder: RunFolder, phase: Phase, init: State, first: int, last: int) -> 
             timed = [{**row, "seconds": seconds} for row in rows]
             folder.record(trial, timed, learned, finite=(learned.params, learned.fit))
             text = f"{phase.name} {trial}/{last}  {records.describe(rows)}"
-            progress.line(f"{text}  {sum(seconds.values()):.1f} s")
+            text = f"{text}  {sum(seconds.values()):.1f} s"
+            progress.line(text)
+            rate, left = progress.pace()
+            folder.update(
+                trial=trial, num_trials=last, line=text,
+                steps_per_second=rate, seconds_left=left,
+            )  # fmt: skip
     return True
 
 

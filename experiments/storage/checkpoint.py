@@ -115,7 +115,8 @@ def restore(
 
     Args:
       directory: as in `save`.
-      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device.
+      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device. Or
+        a function that returns it, of what `pytrees.describe` said of what was saved.
       step: the one to read, or None for the newest.
       part: whether the template may be a part of what was saved, with the same paths.
       warn: gets each warning as one line.
@@ -225,6 +226,8 @@ def _read(
                 raise _DamagedError(f"it is step {record['step']}")
             if whose := foreign(record["meta"]):
                 raise _ForeignError(whose)
+            if callable(template):
+                template = template(record["leaves"])
             if why := _misfit(record, template, part):
                 raise CheckpointError(f"checkpoint {number} in {directory} {why}")
             arrays = manager.restore(number, args=state)["state"]

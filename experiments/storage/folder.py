@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.errors import InterruptedRun, RunError
+from experiments import errors
+from experiments.errors import InterruptedRun, StorageError
 from experiments.parallel import distributed
 from experiments.storage import (
     checkpoint,
@@ -21,10 +22,12 @@ from experiments.storage import (
     metrics,
     pytrees,
     rundir,
+    status,
     trajectories,
 )
-from experiments.storage.environment import compare_environment, environment
+from experiments.storage.environment import environment, remember
 from experiments.storage.identity import Differences
+from experiments.storage.status import Writer
 
 
 class RunFolder(NamedTuple):
@@ -35,10 +38,12 @@ class RunFolder(NamedTuple):
     # Of a run that is written to:
     started: Mapping[str, Any] | None = None  # its config
     differences: Differences = lambda then, now, where: []
+    status: Writer | None = None  # on process 0
 
     def say(self, text: str) -> None:
-        """Prints a line for the user."""
+        """Prints lines for the user; the last one gets into status.json."""
         distributed.say(text)
+        self.update(line=text.splitlines()[-1])
 
     # Reading.
 
@@ -134,9 +139,32 @@ class RunFolder(NamedTuple):
         """Writes what a video is made of."""
         distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
 
+    def computes(self, **entries: str) -> list[str]:
+        """Keeps what computes the run's numbers beside the rest of its environment.
+
+        Returns:
+          A line per entry that is another one than when the run began.
+        """
+        path = self.path / rundir.ENVIRONMENT
+        return distributed.on_first(lambda: remember(path, entries))
+
     def write_json(self, name: str, data: Any) -> None:
         """Replaces a JSON file."""
         distributed.on_first(lambda: rundir.write_json(self.path / name, data))
+
+    def update(self, **changes: Any) -> None:
+        """Puts into status.json how far the run is.
+
+        Args:
+          **changes: fields of `status.Status`.
+        """
+        if self.status is not None:
+            self.status.update(**changes)
+
+    def interrupted(self, reason: str) -> None:
+        """Puts into status.json that this process was stopped; any thread may."""
+        if self.status is not None:
+            self.status.end(status.INTERRUPTED, reason)
 
     @property
     def trajectories(self) -> Path:
@@ -158,7 +186,7 @@ class RunFolder(NamedTuple):
     ) -> tuple[int, Any, dict[str, Any]] | None:
         kept = []
 
-        def read() -> tuple[int, dict[str, Any]] | None:
+        def read() -> tuple[int, dict[str, Any], dict[str, Any]] | None:
             found = checkpoint.restore(
                 self._checkpoints, template, step=step, part=part,
                 warn=lambda line: self.say(f"warning: {line}"), foreign=self._foreign,
@@ -166,13 +194,14 @@ class RunFolder(NamedTuple):
             if found is None:
                 return None
             kept.append(found[1])
-            return found[0], found[2]
+            return found[0], found[2], pytrees.describe(found[1])
 
         found = distributed.on_first(read)
         if found is None:
             return None
-        number, meta = found
-        return number, _shared(kept[0] if kept else None, template), meta
+        number, meta, leaves = found
+        like = template(leaves) if callable(template) else template
+        return number, _shared(kept[0] if kept else None, like), meta
 
     def _foreign(self, meta: dict[str, Any]) -> str | None:
         return identity.foreign(self.path, meta, self.started, self.differences)
@@ -211,49 +240,39 @@ def open_run(
       CheckpointError: if the folder is in use or belongs to another config.
       StorageError: if it cannot be written to.
     """
-    run = RunFolder(path, tuple(config["milestones"]), config, differences)
-    held = _held(path, config, differences, needed_bytes)
+    writer = Writer(path, config["phase"])
+    held = _held(path, config, differences, needed_bytes, writer)
     with distributed.held_by_first(held):
-        yield run
+        own = writer if distributed.is_first() else None
+        yield RunFolder(path, tuple(config["milestones"]), config, differences, own)
 
 
 @contextlib.contextmanager
 def _held(
-    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
-) -> Iterator[None]:
+    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
+    writer: Writer,
+) -> Iterator[None]:  # fmt: skip
     with rundir.lock(path):
         disk.sweep(path)
         rundir.probe(path, needed_bytes)
         _describe(path, config, differences)
-        _status(path, "running")
+        writer.begin()
         try:
             yield
-        except InterruptedRun as error:
-            _status(path, "interrupted", str(error))
-            raise InterruptedRun(
-                f"{error}; at most the trial under way is lost. Continue with the same "
-                "command."
-            ) from error
-        except RunError as error:
-            _status(path, "failed", str(error))
+        except BaseException as error:
+            stopped = isinstance(error, InterruptedRun | KeyboardInterrupt)
+            with contextlib.suppress(StorageError):  # the first error says more
+                state = status.INTERRUPTED if stopped else status.FAILED
+                writer.end(state, errors.reason(error))
             raise
-        _status(path, "complete")
+        writer.end(status.COMPLETE)
 
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Writes config and environment of a new run, compares those of an old one."""
     identity.settle(path, config, differences)
-    if not (path / rundir.ENVIRONMENT).exists():
-        rundir.write_json(path / rundir.ENVIRONMENT, environment())
-        return
-    old = rundir.read_json(path / rundir.ENVIRONMENT)
-    for line in compare_environment(old, environment()):
+    for line in remember(path / rundir.ENVIRONMENT, environment()):
         distributed.say(f"warning: {line}")
-
-
-def _status(path: Path, state: str, reason: str = "") -> None:
-    status = {"state": state, "reason": reason, "time": rundir.now()}
-    rundir.write_json(path / rundir.STATUS, status)
 
 
 def _shared(state: Any, template: Any) -> Any:

@@ -16,10 +16,13 @@ from experiments.storage import checkpoint, rundir
 
 # (of the start, of now, where the first is) -> what differs between configs in JSON.
 Differences = Callable[[Any, Any, str], list[str]]
+_GOAL = "num_trials"  # of a config: the trial that completes a run
 
 
 def settle(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Gives a new folder its config and its id; compares the config of an old one.
+
+    Of an old one only the trial that completes it may change, to a later one.
 
     Raises:
       CheckpointError: if it is of other numbers.
@@ -30,12 +33,16 @@ def settle(path: Path, config: dict[str, Any], differences: Differences) -> None
         if not known and not checkpoint.steps(path / rundir.CHECKPOINTS):
             rundir.write_json(path / rundir.IDENTITY, {"id": secrets.token_hex(8)})
         rundir.write_json(own, config)
-    elif lines := differences(rundir.read_json(own), config, str(own)):
+        return
+    began = rundir.read_json(own)
+    if lines := differences(began, config, str(own)):
         another = "--name" if config["phase"] == "explore" else "--tag"
         raise CheckpointError(
             f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "
             f"flags, or another {another}."
         )
+    if config.get(_GOAL, 0) > began.get(_GOAL, 0):
+        rundir.write_json(own, began | {_GOAL: config[_GOAL]})
 
 
 def read_id(path: Path) -> str | None:
@@ -80,7 +87,5 @@ def foreign(
         return f"of run {found!r}, not {own!r}"
     if config is None:
         return None
-    # A run may have been given more trials since.
-    then = meta["config"] | {k: config[k] for k in ("num_trials",) if k in config}
-    lines = differences(then, config, "its config")
+    lines = differences(meta["config"], config, "its config")
     return f"of other numbers: {'; '.join(lines)}" if lines else None

@@ -16,7 +16,7 @@ Targets are those of PETS: the velocity itself, changes of all else.
 import argparse
 import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +26,8 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from experiments import phases
-from experiments.build import build
+from experiments import exploration
+from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
@@ -122,8 +122,12 @@ def _read(
 ) -> Explored:
     """Restores the models of a run and draws transitions from row `first` on."""
     parts = build(config)
-    whole = phases.explored_template(config, parts)
-    template = phases.model_of(whole)._replace(dataset=whole.dataset)
+    saved = exploration.as_saved(config, parts)
+
+    def template(leaves: Mapping[str, Any]) -> State:
+        whole = saved(leaves)
+        return exploration.model_of(whole)._replace(dataset=whole.dataset)
+
     folder = RunFolder(run)
     if at_trial is None:
         found = folder.restore(template, part=True)

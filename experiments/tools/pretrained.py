@@ -15,8 +15,8 @@ from pathlib import Path
 
 import jax
 
-from experiments import cli, phases
-from experiments.build import build
+from experiments import cli, exploration
+from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
@@ -71,7 +71,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     return folder
 
 
-def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, phases.State]:
+def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, State]:
     """Returns the folder of the last zero-shot, its trial, and the model `[S]` of it.
 
     That of all tasks and without a tag, if there is one.
@@ -81,7 +81,7 @@ def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, phases.State]
     if not evaluated:
         raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
     last = max(evaluated, key=_rank)
-    template = phases.model_of(phases.explored_template(config, build(config)))
+    template = exploration.model_of(exploration.template(config, build(config)))
     found = last.restore(template)
     assert found is not None
     return last, *found

@@ -119,6 +119,7 @@ def test_differences_name_the_field():
     new = json.loads(json.dumps(old))
     assert differences(old, new) == []
     new["planner"]["horizon"], new["seeds"], new["debug"] = 5, [1], True
+    new["num_trials"] = 99  # how long it goes on is not which run it is
     assert differences(old, new) == [
         "planner.horizon: 3 (there) vs 5 (now)",
         "seeds: [0] (there) vs [1] (now)",

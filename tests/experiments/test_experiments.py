@@ -174,6 +174,29 @@ def test_a_finished_run_is_left_alone(again, capsys):
 
 
 @pytest.mark.slow
+def test_a_run_may_be_given_more_trials(straight, again, capsys):
+    longer = [*SMOKE, "--out", str(again.parent), "--num-trials", "4"]
+    assert main(longer) == 0
+    assert [row["trial"] for row in rows(again)] == [1, 2, 3, 4]
+    assert untimed(again)[:3] == untimed(straight[0])
+    assert json.loads((again / "config.json").read_text())["num_trials"] == 4
+    old, new = learner(straight[0]).dataset, learner(again).dataset
+    assert int(new.size) == new.data.obs.shape[1] == 4 * STEPS
+    np.testing.assert_array_equal(new.data.obs[:, : 3 * STEPS], old.data.obs)
+
+    # The last one again, from a checkpoint that has less room; then fewer than all.
+    once = again.parent / "once"
+    shutil.copytree(again, once)
+    shutil.rmtree(again / "checkpoints" / "4")
+    assert main(longer) == 0
+    assert_same_run(again, once)
+    capsys.readouterr()
+    assert main([*longer[:-1], "2"]) == 0
+    assert "already complete: 2 of 2 trials" in capsys.readouterr().err
+    assert json.loads((again / "config.json").read_text())["num_trials"] == 4
+
+
+@pytest.mark.slow
 def test_one_folder_takes_one_process(again):
     before = contents(again)
     with rundir.lock(again):

@@ -172,18 +172,56 @@ def test_what_becomes_of_a_run_is_written(tmp_path):
         assert run.path == tmp_path and run.milestones == (1,)
         assert run.config() == CONFIG
         assert status(tmp_path)["state"] == "running"
+        run.update(trial=2, num_trials=3)
+        run.say("a line\nand the last")
         with pytest.raises(CheckpointError, match="in use by pid"), opened(tmp_path):
             raise AssertionError("two hold it")
-    assert status(tmp_path)["state"] == "complete"
-    with pytest.raises(InterruptedRun, match=r"SIGTERM; .* command"):  # noqa: SIM117
-        with opened(tmp_path):
-            raise InterruptedRun("SIGTERM")
-    assert status(tmp_path) | {"time": ""} == {
-        "state": "interrupted", "reason": "SIGTERM", "time": "",
-    }  # fmt: skip
-    with pytest.raises(StorageError), opened(tmp_path):
-        raise StorageError("the disk is full")
-    assert status(tmp_path)["reason"] == "the disk is full"
+    done = status(tmp_path)
+    assert (done["state"], done["trial"], done["num_trials"]) == ("complete", 2, 3)
+    assert (done["phase"], done["line"]) == ("explore", "and the last")
+    assert (done["pid"], done["reason"]) == (os.getpid(), "")
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "reason"),
+    [
+        (InterruptedRun("SIGTERM"), "interrupted", "SIGTERM"),
+        (KeyboardInterrupt(), "interrupted", "KeyboardInterrupt"),
+        (StorageError("the disk is full"), "failed", "the disk is full"),
+        (MemoryError(), "failed", "MemoryError"),
+        (OSError(28, "No space"), "failed", "OSError: [Errno 28] No space"),
+        (RuntimeError("a bug\nof ours"), "failed", "RuntimeError: a bug"),
+        (SystemExit(3), "failed", "SystemExit: 3"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_no_end_leaves_a_run_running(tmp_path, error, state, reason):
+    with pytest.raises(type(error)), opened(tmp_path) as run:
+        run.update(trial=1)
+        raise error
+    found = status(tmp_path)
+    assert (found["state"], found["reason"], found["trial"]) == (state, reason, 1)
+
+
+def test_a_full_disk_does_not_keep_the_end_a_secret(tmp_path, monkeypatch):
+    def full(_file):
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(RuntimeError), opened(tmp_path) as run:
+        run.update(line="x" * 1000)
+        monkeypatch.setattr(rundir.os, "fsync", full)
+        run.update(line="short")
+        raise RuntimeError("a bug")
+    found = status(tmp_path)
+    assert (found["state"], found["line"]) == ("failed", "short")
+
+
+def test_what_comes_after_the_end_is_not_written(tmp_path):
+    with opened(tmp_path) as run:
+        run.interrupted("SIGTERM")  # from another thread
+        run.update(trial=7)
+    found = status(tmp_path)
+    assert (found["state"], found["trial"]) == ("interrupted", None)
 
 
 @pytest.mark.parametrize(
@@ -200,6 +238,21 @@ def test_a_folder_belongs_to_one_config(tmp_path, phase, flag):
         f"or another {flag}."
     )
     assert RunFolder(tmp_path).config()["seeds"] == [1]
+
+
+def test_a_run_is_given_more_trials_and_never_fewer(tmp_path):
+    for count, kept in ((3, 3), (5, 5), (4, 5)):
+        with opened(tmp_path, CONFIG | {"num_trials": count}) as run:
+            assert run.config() == CONFIG | {"num_trials": kept}
+
+
+def test_a_template_may_be_made_of_what_was_saved(tmp_path):
+    run = RunFolder(tmp_path)
+    run.save(1, {"rows": jnp.ones((5, 2))})
+    trial, found = run.restore(
+        lambda leaves: {"rows": jnp.zeros(leaves["rows"]["shape"])}
+    )
+    assert trial == 1 and found["rows"].tolist() == [[1.0, 1.0]] * 5
 
 
 def test_another_environment_is_said(tmp_path, capsys):

@@ -22,10 +22,12 @@ SOURCES = Path(build.__file__).parent
 
 def test_one_compilation_per_model(cache, compiler, making, registered):
     compiler(making.script)
-    target = load("// one", Kind.GPU_REFERENCE)
-    assert load("// one", Kind.GPU_REFERENCE) == target  # as the next process does
+    target, _ = load("// one", Kind.GPU_REFERENCE)
+    assert (
+        load("// one", Kind.GPU_REFERENCE).target == target
+    )  # as the next process does
     assert len(making.commands) == 1
-    other = load("// two", Kind.GPU_REFERENCE)
+    other, _ = load("// two", Kind.GPU_REFERENCE)
     assert other != target and len(making.commands) == 2
     assert registered == [(name, "cpu") for name in (target, target, other)]
     assert {path.name for path in cache.iterdir()} == {f"{target}.so", f"{other}.so"}
@@ -34,18 +36,18 @@ def test_one_compilation_per_model(cache, compiler, making, registered):
 def test_a_process_asks_once(compiler, making, registered):
     compiler(making.script)
     build.load_kernel("// asked twice", Kind.GPU_REFERENCE)
-    target = build.load_kernel("// asked twice", Kind.GPU_REFERENCE)
+    target, _ = build.load_kernel("// asked twice", Kind.GPU_REFERENCE)
     assert len(making.commands) == 1 and registered == [(target, "cpu")]
     assert target.startswith("jaxpets_rollout_gpu_reference_")
 
 
 @pytest.mark.parametrize("kind", [Kind.CPU, Kind.GPU_REFERENCE])
-@pytest.mark.parametrize("change", ["sources", "jax", "compiler"])
+@pytest.mark.parametrize("change", ["sources", "jax", "compiler", "version"])
 def test_another_recipe_is_another_kernel(
     monkeypatch, tmp_path, compiler, making, change, kind
 ):
     compiler(making.script)
-    target = load("// one", kind)
+    target, _ = load("// one", kind)
     if change == "sources":
         edited = Path(shutil.copytree(SOURCES, tmp_path / "edited"))
         with (edited / "sizes.h").open("a") as file:
@@ -55,7 +57,9 @@ def test_another_recipe_is_another_kernel(
         monkeypatch.setattr(jax, "__version__", "0.0.1")
     if change == "compiler":
         compiler(making.script, name="clang++")
-    assert load("// one", kind) != target
+    if change == "version":
+        compiler(making.script, version="c++ 1.3")
+    assert load("// one", kind).target != target
     assert len(making.commands) == 2
 
 
@@ -71,7 +75,7 @@ def test_every_kind_is_a_library_of_its_own(
     cache, compiler, making, registered, kind, program, source, registry
 ):
     file = compiler(making.script, name=program)
-    target = load("// one", kind)
+    target, _ = load("// one", kind)
     ((name, *_, last),) = making.commands
     assert name == str(file) and Path(last).name == source
     assert target.startswith(f"jaxpets_rollout_{kind.name.lower()}_")
@@ -83,9 +87,9 @@ def test_every_kind_is_a_library_of_its_own(
 def test_a_processor_has_a_library_of_its_own(compiler, making):
     """Where machines share a folder; the reference is for all of them."""
     compiler(making.script)
-    target, shared = load("// one", Kind.CPU), load("// one", Kind.GPU_REFERENCE)
+    own, shared = load("// one", Kind.CPU), load("// one", Kind.GPU_REFERENCE)
     compiler(making.script, processor="echo '#define __MORE__ 1'")
-    assert load("// one", Kind.CPU) != target
+    assert load("// one", Kind.CPU) != own
     assert load("// one", Kind.GPU_REFERENCE) == shared
     assert len(making.commands) == 3
 
@@ -142,7 +146,7 @@ def test_without_xdg_the_cache_is_in_the_home_folder(
         monkeypatch.delenv("XDG_CACHE_HOME")
     else:
         monkeypatch.setenv("XDG_CACHE_HOME", value)
-    target = load("// one", Kind.GPU_REFERENCE)
+    target, _ = load("// one", Kind.GPU_REFERENCE)
     assert (tmp_path / "home" / ".cache" / "jaxpets" / f"{target}.so").exists()
 
 
@@ -165,7 +169,7 @@ def test_many_may_build_at_once(cache, compiler, making):
     assert len(set(targets)) == 1
     outputs = [command[command.index("-o") + 1] for command in making.commands]
     assert len(set(outputs)) == len(outputs)
-    assert [path.name for path in cache.iterdir()] == [f"{targets[0]}.so"]
+    assert [path.name for path in cache.iterdir()] == [f"{targets[0].target}.so"]
 
 
 def test_a_cache_that_cannot_be_written_says_so(cache, compiler, making):

@@ -59,6 +59,27 @@ def test_a_broken_library_says_so(compiler, registered):
     assert not registered
 
 
+NVCC = """nvcc: NVIDIA (R) Cuda compiler driver
+Copyright (c) 2005-2025 NVIDIA Corporation
+Cuda compilation tools, release 13.0, V13.0.88
+Build cuda_13.0.r13.0/compiler.36424714_0"""
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("c++ (Debian 12.2.0-14) 12.2.0\nCopyright (C) 2022", None),
+        ("Apple clang version 15.0.0 (clang-1500.3.9.4)", None),
+        (NVCC, "Cuda compilation tools, release 13.0, V13.0.88"),
+        ("a compiler", "unknown"),
+    ],
+)
+def test_a_kernel_knows_what_built_it(compiler, making, said, words):
+    compiler(making.script, version=said)
+    kernel = load("// one", Kind.GPU_REFERENCE)
+    assert kernel.compiler == (words or said.splitlines()[0])
+
+
 # Compilers that are found.
 
 

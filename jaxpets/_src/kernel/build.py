@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 
@@ -31,9 +32,16 @@ class BuildError(Exception):
     """No kernel: a compiler is missing or failed. The message is one line."""
 
 
+class Kernel(NamedTuple):
+    """A kernel that XLA may call."""
+
+    target: str  # its name among XLA's FFI targets
+    compiler: str  # name and version of what built it
+
+
 @functools.cache
-def load_kernel(model: str, kind: Kind) -> str:
-    """Compiles the rollout for a model and registers it; returns its FFI target.
+def load_kernel(model: str, kind: Kind) -> Kernel:
+    """Compiles the rollout for a model and registers it with XLA.
 
     The library is kept in the user's cache folder and found there by the next process.
 
@@ -45,7 +53,8 @@ def load_kernel(model: str, kind: Kind) -> str:
       BuildError: if it cannot be built.
     """
     compiler = _compiler(kind)
-    recipe = [jax.__version__, *compiler]
+    version = _version(compiler[0])
+    recipe = [jax.__version__, *compiler, version]
     if kind is Kind.CPU:
         # A folder that machines share has a library for every kind of processor.
         recipe.append(_processor(compiler))
@@ -64,7 +73,7 @@ def load_kernel(model: str, kind: Kind) -> str:
         raise BuildError(f"cannot load the compiled kernel: {error}") from error
     where = "CUDA" if kind is Kind.GPU else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
-    return target
+    return Kernel(target, version)
 
 
 def _shipped_sources() -> dict[str, str]:
@@ -136,6 +145,13 @@ def _host_compiler() -> list[str]:
         if path := shutil.which(name):
             return [path, "-std=c++17", "-O2", "-shared", "-fPIC"]
     raise BuildError("no C++ compiler found (c++, g++ or clang++)")
+
+
+def _version(compiler: str) -> str:
+    """Returns a compiler's name and version, as it says them."""
+    lines = _run([compiler, "--version"]).splitlines()
+    named = (line.strip() for line in lines if re.search(r"\d\.\d", line))
+    return next(named, "unknown")
 
 
 def _processor(compiler: list[str]) -> str:
