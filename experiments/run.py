@@ -162,7 +162,11 @@ def _plain_errors(config: Config) -> Iterator[None]:
     except MemoryError as error:
         raise OutOfMemoryError(memory_advice(config)) from error
     except OSError as error:
-        raise StorageError(f"{error.strerror} ({error.filename}).") from error
+        doing = f"use {error.filename}" if error.filename else "go on"
+        raise StorageError(
+            f"cannot {doing} ({error.strerror or error}). Check the disk, and what "
+            "reads the output, and run the same command."
+        ) from error
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise

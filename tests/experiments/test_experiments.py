@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -146,6 +147,23 @@ def test_interrupted_and_resumed_equals_uninterrupted(straight, tmp_path):
     assert code == 0
     assert errors.startswith("explore 2/3")
     assert_same_run(folder, straight[0])
+
+
+@pytest.mark.slow
+def test_a_refit_that_would_take_minutes_stops_in_time(again):
+    refit = ("--refit.num-epochs", "10000", "--refit.batch-size", "1")
+    process = start("--phase", "zero-shot", "--from", again, *refit)
+    path = again / "zero-shot-003" / "status.json"
+    while not path.exists() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(2)  # it compiles, or runs
+    process.send_signal(signal.SIGHUP)
+    begin = time.monotonic()
+    code, errors = finish(process)
+    assert code == 75, errors
+    assert time.monotonic() - begin < 8.0  # five, and what a busy machine adds
+    assert errors.startswith("stopped: SIGHUP; ") and errors.count("\n") == 1
+    assert status(path.parent) == "interrupted"
 
 
 @pytest.mark.slow
