@@ -6,6 +6,8 @@ A row is a trial of a seed, and of a task where one is sought:
                              explored_trials, the trials behind their model
     value                    predicted reward per imagined step
     turns                    net turns of the torso, nose down
+    bad_plans                steps whose every candidate was imagined to be not finite;
+                             left out where there is none
     returns                  of the trial under every task; return is that of its own
     fit                      of the model after the trial, where there was one
     seconds                  act and fit

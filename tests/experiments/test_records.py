@@ -2,11 +2,16 @@
 
 import json
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import jaxpets
+from experiments import records
+from experiments.acting import Trials
 from experiments.records import describe
 from experiments.storage import metrics
-from jaxpets.envs.half_cheetah import TASK_NAMES
+from jaxpets.envs.half_cheetah import OBS_SIZE, TASK_NAMES
 
 
 def row(returns, **labels):
@@ -29,6 +34,17 @@ def test_a_task_counts_where_it_was_sought():
         row([-7, 7, 0, 0], task="backward"),
     ]
     assert describe(rows) == "value 2  returns:  forward 15  backward 7"
+
+
+def test_plans_without_a_finite_candidate_are_counted():
+    """Every candidate of two steps of the second trial, at a horizon of 30."""
+    values = np.ones((2, 3), np.float32)
+    values[1, :2] = jaxpets.optimizers.WORST_VALUE / 30
+    obs = jnp.zeros((2, 3, OBS_SIZE))
+    trials = Trials(jaxpets.Transition(obs, jnp.zeros((2, 3, 6)), obs), values)
+    good, bad = records.rows([{"phase": "explore"}] * 2, trials)
+    assert "bad_plans" not in good and bad["bad_plans"] == 2
+    assert describe([good, bad]).endswith("  bad plans: 2")
 
 
 def test_a_log_of_an_older_version_has_todays_names(tmp_path):
