@@ -16,13 +16,13 @@ from experiments.storage import checkpoint, rundir
 
 # (of the start, of now, where the first is) -> what differs between configs in JSON.
 Differences = Callable[[Any, Any, str], list[str]]
-_GOAL = "num_trials"  # of a config: the trial that completes a run
+_GOAL = "num_trials"  # which trial completes a run; not a part of which run it is
 
 
 def settle(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Gives a new folder its config and its id; compares the config of an old one.
 
-    Of an old one only the trial that completes it may change, to a later one.
+    An old one may be given more trials.
 
     Raises:
       CheckpointError: if it is of other numbers.
