@@ -15,6 +15,7 @@ from experiments.cost import check_cpu, memory_advice
 from experiments.entries import differences, from_json, to_json
 from experiments.errors import (
     CheckpointError,
+    InterruptedRun,
     OutOfMemoryError,
     RunError,
     StorageError,
@@ -45,9 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config)
-    except RunError as error:
+    except (RunError, KeyboardInterrupt) as end:
         if "--debug" in arguments:
             traceback.print_exc()
+        # There may be no run yet that turns a signal into an error.
+        error = end if isinstance(end, RunError) else InterruptedRun("SIGINT")
         signals.say(last_line(error))
         return error.exit_code
     return 0
