@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from experiments.errors import CheckpointError
+from experiments.errors import CheckpointError, printable
 from experiments.storage import rundir, status
 from experiments.storage.status import Status
 
@@ -58,14 +58,18 @@ def _row(run: Path) -> tuple[str, ...]:
     try:
         found = status.read(run)
     except CheckpointError as error:
-        return _printable(run, "unreadable", "", "", "", error)
+        return _cells(run, "unreadable", "", "", "", error)
     trial = f"{found.trial}" if found.trial is not None else ""
     trial += f"/{found.num_trials}" if found.num_trials is not None else ""
     running, rate = found.state == status.RUNNING, found.steps_per_second
     speed = f"{rate:.1f}" if running and rate is not None else ""
-    return _printable(
-        run, found.state, trial, speed, _left(found.seconds_left), _said(found)
-    )
+    left = _left(found.seconds_left)
+    return _cells(run, found.state, trial, speed, left, _said(found))
+
+
+def _cells(*values: object) -> tuple[str, ...]:
+    """Returns what is shown of values, which may come from the files of a stranger."""
+    return tuple(printable(str(value)).replace("\n", " ") for value in values)
 
 
 def _said(found: Status) -> str:
@@ -79,13 +83,6 @@ def _left(seconds: float | None) -> str:
         return ""
     minutes = seconds / 60
     return f"{minutes:.1f} min" if minutes < 60 else f"{minutes / 60:.1f} h"
-
-
-def _printable(*cells: object) -> tuple[str, ...]:
-    """Returns cells of one line each; what is in a file may be meant for a terminal."""
-    return tuple(
-        "".join(c if c.isprintable() else "?" for c in str(cell)) for cell in cells
-    )
 
 
 def _print(rows: Sequence[Sequence[str]]) -> None:

@@ -87,7 +87,7 @@ def test_the_table_shows_every_run(tmp_path, capsys):
     assert code == 0 and set(rows) == {
         *("run", "on", "away", "broke", "gone", "zero-shot-004", "old", "torn")
     }  # fmt: skip
-    words = ["running", "4/9", "3.2", "1.5", "min", "explore", "4/9", "?[31mred"]
+    words = ["running", "4/9", "3.2", "1.5", "min", "explore", "4/9", r"\x1b[31mred"]
     assert rows["on"].split()[1:] == words
     assert "running" in rows["away"] and "on h1, " in rows["away"]
     assert "failed" in rows["broke"] and rows["broke"].endswith("the disk is full")
