@@ -11,11 +11,12 @@ import platform
 import re
 import shutil
 import subprocess
-import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+
+from jaxpets._src.kernel import cache
 
 _SYMBOL = "jaxpets_rollout"
 
@@ -43,7 +44,7 @@ class Kernel(NamedTuple):
 def load_kernel(model: str, kind: Kind) -> Kernel:
     """Compiles the rollout for a model and registers it with XLA.
 
-    The library is kept in the user's cache folder and found there by the next process.
+    The library is kept for the next process, see `cache`.
 
     Args:
       model: the text of `model.h`.
@@ -52,6 +53,8 @@ def load_kernel(model: str, kind: Kind) -> Kernel:
     Raises:
       BuildError: if it cannot be built.
     """
+    if os.name != "posix":
+        raise BuildError("kernels are built on Linux and macOS only")
     compiler = _compiler(kind)
     version = _version(compiler[0])
     recipe = [jax.__version__, *compiler, version]
@@ -61,16 +64,12 @@ def load_kernel(model: str, kind: Kind) -> Kernel:
     sources = {**_shipped_sources(), "model.h": model}
     digest = hashlib.sha256("\0".join([*recipe, *sources.values()]).encode())
     target = f"{_SYMBOL}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
-    library = _cache_folder() / f"{target}.so"
+    make = functools.partial(_compile, compiler, sources, kind)
     try:
-        if not library.exists():
-            _compile(compiler, sources, kind.value, library)
+        with cache.library(target, make) as library:
+            handler = _loaded(library)
     except OSError as error:
-        raise BuildError(f"cannot write to the cache folder: {error}") from error
-    try:
-        handler = getattr(ctypes.CDLL(str(library)), _SYMBOL)
-    except OSError as error:
-        raise BuildError(f"cannot load the compiled kernel: {error}") from error
+        raise BuildError(f"there is no folder to build it in: {error}") from error
     where = "CUDA" if kind is Kind.GPU else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
     return Kernel(target, version)
@@ -88,18 +87,24 @@ def _shipped_sources() -> dict[str, str]:
 
 
 def _compile(
-    compiler: list[str], sources: dict[str, str], main: str, library: Path
-) -> None:
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as name:
-        folder = Path(name)
-        for file, text in sources.items():
-            (folder / file).write_text(text)
-        built = folder / library.name
-        include = [f"-I{name}", f"-I{jax.ffi.include_dir()}"]
-        command = [*compiler, *include, "-o", str(built), str(folder / main)]
-        _run(command)
-        os.replace(built, library)  # whole or not at all, with others building too
+    compiler: list[str], sources: dict[str, str], kind: Kind, folder: Path
+) -> Path:
+    """Compiles in an empty folder and returns the library's file."""
+    for file, text in sources.items():
+        (folder / file).write_text(text)
+    library = folder / "library.so"
+    include = [f"-I{folder}", f"-I{jax.ffi.include_dir()}"]
+    command = [*compiler, *include, "-o", str(library), str(folder / kind.value)]
+    _run(command)
+    return library
+
+
+def _loaded(library: Path) -> Any:
+    """Returns the kernel of a library as a function of C."""
+    try:
+        return getattr(ctypes.CDLL(str(library)), _SYMBOL)
+    except (OSError, AttributeError) as error:
+        raise BuildError(f"cannot load the compiled kernel: {error}") from error
 
 
 def _run(command: list[str]) -> str:
@@ -118,14 +123,6 @@ def _run(command: list[str]) -> str:
         first = (lines or done.stderr.splitlines() or ["no message"])[0]
         raise BuildError(f"{name} failed: {first}")
     return done.stdout
-
-
-def _cache_folder() -> Path:
-    try:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError as error:
-        raise BuildError("there is no home folder; set XDG_CACHE_HOME") from error
-    return Path(home) / "jaxpets"
 
 
 def _compiler(kind: Kind) -> list[str]:
