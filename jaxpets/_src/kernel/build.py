@@ -1,5 +1,6 @@
 """Compiling the kernel for one model, once, and handing it to XLA."""
 
+import contextlib
 import ctypes
 import enum
 import functools
@@ -10,6 +11,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +21,8 @@ import jax
 from jaxpets._src.kernel import cache
 
 _SYMBOL = "jaxpets_rollout"
+# Seconds until a compiler is ended. A kernel takes five, and half a minute on a GPU.
+_LIMIT, _GPU_LIMIT = 120.0, 300.0
 
 
 class Kind(enum.Enum):
@@ -95,7 +99,7 @@ def _compile(
     library = folder / "library.so"
     include = [f"-I{folder}", f"-I{jax.ffi.include_dir()}"]
     command = [*compiler, *include, "-o", str(library), str(folder / kind.value)]
-    _run(command)
+    _run(command, _GPU_LIMIT if kind is Kind.GPU else _LIMIT)
     return library
 
 
@@ -107,22 +111,39 @@ def _loaded(library: Path) -> Any:
         raise BuildError(f"cannot load the compiled kernel: {error}") from error
 
 
-def _run(command: list[str]) -> str:
+def _run(command: list[str], limit: float) -> str:
     """Returns what a compiler prints.
 
     Raises:
-      BuildError: if it cannot be run, or fails.
+      BuildError: if it cannot be run, fails, or takes more than `limit` seconds.
     """
     name = Path(command[0]).name
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        # In a process group of its own: what the compiler starts ends with it.
+        with subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            process_group=0,
+        ) as process:
+            try:
+                output, said = process.communicate(timeout=limit)
+            except BaseException:  # the user's interrupt too: it reaches us alone
+                with contextlib.suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                raise
+    except subprocess.TimeoutExpired as error:
+        raise BuildError(f"{name} was not done in {limit:g} seconds") from error
     except OSError as error:
         raise BuildError(f"cannot run {name}: {error}") from error
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if "error" in line]
-        first = (lines or done.stderr.splitlines() or ["no message"])[0]
+    if process.returncode:
+        lines = [line for line in said.splitlines() if "error" in line]
+        first = (lines or said.splitlines() or ["no message"])[0]
         raise BuildError(f"{name} failed: {first}")
-    return done.stdout
+    return output
 
 
 def _compiler(kind: Kind) -> list[str]:
@@ -146,7 +167,7 @@ def _host_compiler() -> list[str]:
 
 def _version(compiler: str) -> str:
     """Returns a compiler's name and version, as it says them."""
-    lines = _run([compiler, "--version"]).splitlines()
+    lines = _run([compiler, "--version"], _LIMIT).splitlines()
     named = (line.strip() for line in lines if re.search(r"\d\.\d", line))
     return next(named, "unknown")
 
@@ -158,7 +179,7 @@ def _processor(compiler: list[str]) -> str:
       BuildError: if it does not know the processor, or that cannot multiply and add at
         once, without which every step of a polynomial is a call.
     """
-    defined = _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull])
+    defined = _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull], _LIMIT)
     if not re.search(r"\b(__FMA__|__ARM_FEATURE_FMA)\b", defined):
         raise BuildError("the processor has no fused multiply-add")
     return defined
