@@ -32,10 +32,13 @@ class FusedRollout:
       bind: `(EnsembleParams) -> (key, obs, actions) -> path`; lays the weights out for
         the kernel, once for many calls.
       reason: why the scan runs and no kernel; empty if the kernel does.
+      compiler: name and version of the compiler of the kernel; empty if the scan runs.
+        With another one, or on another processor, the last bits may be others.
     """
 
     bind: Callable[[EnsembleParams], Callable[[Array, Array, Array], Array]]
     reason: str = ""
+    compiler: str = ""
 
     @property
     def uses_kernel(self) -> bool:
@@ -104,7 +107,7 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
     )
     try:
         layout = _layout(model, config, space, kind)
-        target = load_kernel(_model_header(config, space, layout, kind), kind)
+        kernel = load_kernel(_model_header(config, space, layout, kind), kind)
     except (BuildError, UnsupportedError) as error:
         return FusedRollout(lambda params: functools.partial(scan, params), str(error))
 
@@ -125,13 +128,13 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
             # The scan knows what params must be; the kernel would read past their end.
             path: jax.ShapeDtypeStruct = jax.eval_shape(scan, params, key, obs, actions)
             num_samples, horizon, _ = actions.shape
-            call = jax.ffi.ffi_call(target, path, vmap_method="expand_dims")
+            call = jax.ffi.ffi_call(kernel.target, path, vmap_method="expand_dims")
             keys = _keys(key, horizon, num_samples)
             return call(weights, shared, keys, obs, actions)
 
         return rollout
 
-    return FusedRollout(bind)
+    return FusedRollout(bind, compiler=kernel.compiler)
 
 
 def _origin(model: Ensemble) -> tuple[EnsembleConfig, ModelSpace]:

@@ -28,19 +28,22 @@ def compiler(monkeypatch, tmp_path):
     """Makes a shell script the only program on the path, as a compiler.
 
     It gets what a compiler gets, and runs under the path of the tests. Asked about the
-    processor it knows the least that will do, and runs `processor`. Returns the file.
+    processor it knows the least that will do, and runs `processor`; asked who it is it
+    says `version`. Returns the file.
     """
     folder = tmp_path / "bin"
     path = shlex.quote(os.environ["PATH"])
 
-    def install(script, name="c++", processor=":"):
+    def install(script, name="c++", processor=":", version="c++ 1.2"):
         folder.mkdir(exist_ok=True)
         for other in folder.iterdir():
             other.unlink()
         file = folder / name
         least = "echo '#define __FMA__ 1'"
-        asked = f'case "$*" in *-dM*) {least}; {processor}; exit;; esac'
-        file.write_text(f"#!/bin/sh\nexport PATH={path}\n{asked}\n{script}\n")
+        said = f"printf '%s\\n' {shlex.quote(version)}"
+        asked = f"--version) {said}; exit;; *-dM*) {least}; {processor}; exit;;"
+        first = f'export PATH={path}; case "$*" in {asked} esac'
+        file.write_text(f"#!/bin/sh\n{first}\n{script}\n")
         file.chmod(0o755)
         monkeypatch.setenv("PATH", str(folder))
         return file

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import os
 import platform
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -44,6 +45,7 @@ def test_observations_and_actions_may_be_wide():
 def test_every_precision_is_float32(precision):
     fused, caught = recorded(lambda: SMALL.fused(precision))
     assert not caught and fused.uses_kernel and fused.reason == ""
+    assert re.search(r"(c\+\+|clang) .*\d\.\d", fused.compiler)
     got = jax.jit(fused)(*SMALL.args())
     np.testing.assert_array_equal(got, CPU.run(SMALL)(*SMALL.args()))
 

@@ -9,7 +9,7 @@ import pytest
 from rollouts import CASES, CHEETAH, SMALL, recorded, relative_error, stacked
 
 from jaxpets._src import fused_rollout as module
-from jaxpets._src.kernel.build import Kind
+from jaxpets._src.kernel.build import Kernel, Kind
 
 
 def pretend(monkeypatch, **attributes):
@@ -38,7 +38,7 @@ def test_on_a_hopper_gpu_the_kernel_is_built(monkeypatch):
 
     def load_kernel(model, kind):
         asked.append((model, kind))
-        return "target"
+        return Kernel("target", "nvcc 13.0")
 
     monkeypatch.setattr(module, "load_kernel", load_kernel)
     _, caught = recorded(SMALL.fused)
