@@ -11,9 +11,8 @@ from pathlib import Path
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 # Nearly all time goes into compiling, and on CPUs a good part of that into LLVM's
-# optimisations and XLA's fused loops: without them the suite takes less than half of the
-# time. Flags of the user's own come last, and win; processes that tests start inherit
-# these.
+# optimisations and XLA's fused loops: without them the suite takes half of the time.
+# Flags of the user's own come last, and win; processes that tests start inherit these.
 if os.environ["JAX_PLATFORMS"] == "cpu":
     _flags = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
     os.environ["XLA_FLAGS"] = f"{_flags} {os.environ.get('XLA_FLAGS', '')}".strip()
