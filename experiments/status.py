@@ -49,9 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _runs(folder: Path) -> Iterator[Path]:
     """Returns the runs in a folder, but for hidden ones."""
-    for path in sorted(folder.rglob(rundir.STATUS)):
-        if not any(part.startswith(".") for part in path.relative_to(folder).parts):
-            yield path.parent
+    for run in sorted(path.parent for path in folder.rglob(rundir.STATUS)):
+        if not any(part.startswith(".") for part in run.relative_to(folder).parts):
+            yield run
 
 
 def _row(run: Path) -> tuple[str, ...]:
