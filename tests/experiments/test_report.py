@@ -7,8 +7,7 @@ import pytest
 from small_logs import EXPLORED, explore_rows, write_run
 
 from experiments.errors import CheckpointError, UsageError
-from experiments.report import task_sections
-from experiments.report.logs import scores
+from experiments.report import logs, task_sections
 from experiments.report.report import load, write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
@@ -305,7 +304,7 @@ def test_random_trials_without_returns_are_left_out(out):
     log = out / "laptop-count" / "metrics.jsonl"
     edit_rows(log, lambda row: row | {"returns": None})
     rows = [row for row in load(out) if row.arm == "count-16"]
-    lines = task_sections.zero_shot(rows, scores(rows, EXPLORED), EXPLORED)
+    lines = task_sections.zero_shot(rows, logs.scores(rows, EXPLORED), EXPLORED)
     assert "### Every seed" in lines and not any("Random" in line for line in lines)
 
 
