@@ -84,7 +84,7 @@ def foreign(
     if own is None or found is None:
         return None
     if found != own:
-        return f"of run {found!r}, not {own!r}"
+        return f"of run {found!r}; {rundir.IDENTITY} says {own!r}"
     if config is None:
         return None
     lines = differences(meta["config"], config, "its config")

@@ -135,7 +135,7 @@ def read_json(path: Path, limit: int = _MAX_JSON_BYTES) -> Any:
       CheckpointError: It is missing, too large or not JSON; the message says where.
     """
     if not path.is_file():
-        raise CheckpointError(f"{path} does not exist or is not a file.")
+        raise CheckpointError(f"{path} does not exist or is not a file. Restore it.")
     try:
         with path.open("rb") as file:
             data = file.read(limit + 1)

@@ -94,6 +94,9 @@ def test_trajectories_are_whole_or_made_again(tmp_path):
     for data in (b"", whole[:-30], bytes(flipped)):
         run.trajectories.write_bytes(data)
         assert not run.has_trajectories()
+    run.trajectories.unlink()
+    os.mkfifo(run.trajectories)
+    assert not run.has_trajectories()
 
 
 @pytest.mark.parametrize(
@@ -298,8 +301,8 @@ def test_a_checkpoint_of_another_run_is_not_used(tmp_path, capsys):
     assert resumed(own) == 1
     a, b = (identity.read_id(run) for run in (own, other))
     assert capsys.readouterr().err == (
-        f"warning: checkpoint 2 is foreign (of run {b!r}, not {a!r}); moved to "
-        ".foreign-2, using 1.\n"
+        f"warning: checkpoint 2 is foreign (of run {b!r}; run.json says {a!r}); "
+        "moved to .foreign-2, using 1.\n"
     )
     assert (own / rundir.METRICS).read_bytes() == log.splitlines(keepends=True)[0]
     moved(other, own, 1)

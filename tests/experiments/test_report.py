@@ -7,6 +7,7 @@ import pytest
 from small_logs import EXPLORED, explore_rows, write_run
 
 from experiments.errors import CheckpointError, UsageError
+from experiments.report import logs, task_sections
 from experiments.report.report import load, write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
@@ -297,6 +298,14 @@ def test_a_setting_that_a_run_did_not_record_is_named(tmp_path):
         "zero-shot: refit.bootstrap is False (laptop-best); True (laptop-count" in text
     )
     assert "); not recorded (laptop-random)." in text
+
+
+def test_random_trials_without_returns_are_left_out(out):
+    log = out / "laptop-count" / "metrics.jsonl"
+    edit_rows(log, lambda row: row | {"returns": None})
+    rows = [row for row in load(out) if row.arm == "count-16"]
+    lines = task_sections.zero_shot(rows, logs.scores(rows, EXPLORED), EXPLORED)
+    assert "### Every seed" in lines and not any("Random" in line for line in lines)
 
 
 def test_what_a_phase_does_not_use_may_differ_in_it(tmp_path):
