@@ -25,7 +25,7 @@ from jax import Array
 
 import jaxpets
 from benchmarks import rows, workloads
-from experiments import phases
+from experiments import exploration
 from experiments.build import build
 from experiments.entries import from_json
 from experiments.errors import RunError
@@ -120,7 +120,7 @@ def _explored(
         )
     if config.model.state_margin != jaxpets.EnsembleConfig().state_margin:
         raise SystemExit(f"{folder} has its own --model.state-margin")
-    template = phases.model_of(phases.explored_template(config, build(config)))
+    template = exploration.model_of(exploration.template(config, build(config)))
     found = run.restore(template)
     if found is None:
         raise SystemExit(f"there is no checkpoint in {folder}")

@@ -1,6 +1,7 @@
 """From a config to the parts of the library: environment, model, planners, learner."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from experiments.config import (
 from jaxpets.envs import half_cheetah
 
 State = jaxpets.LearnerState
+KERNEL, SCAN = "kernel", "scan"
 Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
 # Every phase draws from its own stream of keys.
@@ -41,6 +43,9 @@ class Parts(NamedTuple):
     explorer: jaxpets.Planner  # phase 1
     actor: jaxpets.Planner  # phase 2; reward data are the weights of a task
     learner: jaxpets.Learner  # phase 1
+    reward_data: jaxpets.RewardData  # of its reward
+    explored_by: str  # what imagines in phase 1, as env.json has it
+    performed_by: str  # and in phase 2
     refitter: jaxpets.Fitter | None  # between the phases
     finetuner: jaxpets.Learner  # phase 2
 
@@ -57,10 +62,11 @@ def build(config: Config) -> Parts:
 
     def planner(
         reward_fn: jaxpets.typing.RewardFn, search: PlannerConfig
-    ) -> jaxpets.Planner:
-        rollout, is_kernel = _rollout(size, search)
-        unroll = is_kernel and jax.default_backend() == "gpu"
-        return jaxpets.plan(rollout, reward_fn, optimizer(search, env, unroll))
+    ) -> tuple[jaxpets.Planner, str]:
+        rollout, kind = _rollout(size, search)
+        unroll = kind.startswith(KERNEL) and jax.default_backend() == "gpu"
+        search_fn = optimizer(search, env, unroll)
+        return jaxpets.plan(rollout, reward_fn, search_fn), kind
 
     reward = half_cheetah.task_reward
     if config.pessimism:
@@ -75,15 +81,22 @@ def build(config: Config) -> Parts:
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
 
+    explorer, explored_by = (random, "none")
+    if arm.reward_fn is not None:
+        explorer, explored_by = planner(arm.reward_fn, config.planner)
+    actor, performed_by = planner(reward, config.task_planner)
     return Parts(
         env=env,
         model=trained,
         random=random,
-        explorer=planner(arm.reward_fn, config.planner) if arm.reward_fn else random,
-        actor=planner(reward, config.task_planner),
+        explorer=explorer,
+        actor=actor,
         learner=learner(
             config.training, arm.reward_data, config.trial_length, explored
         ),
+        reward_data=arm.reward_data,
+        explored_by=explored_by,
+        performed_by=performed_by,
         refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
         finetuner=learner(
             config.tuning,
@@ -130,18 +143,24 @@ def _ensemble(
 
 def _rollout(
     size: jaxpets.EnsembleConfig, search: PlannerConfig
-) -> tuple[jaxpets.typing.RolloutFn, bool]:
-    """Returns the rollout of a search, and whether it is a kernel."""
+) -> tuple[jaxpets.typing.RolloutFn, str]:
+    """Returns the rollout of a search, and what decides about its last bits.
+
+    That is the compiler of a kernel, or the scan, with a reason if it was not wanted.
+    """
     precision = jaxpets.Precision(search.precision)
     model = _ensemble(size, precision)
     may_have_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
     if search.fused and may_have_kernel.get(jax.default_backend(), False):
-        rollout = jaxpets.fused_rollout(model, num_particles=search.num_particles)
-        return rollout, rollout.uses_kernel
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".* runs as a scan")  # the phases say it
+            rollout = jaxpets.fused_rollout(model, num_particles=search.num_particles)
+        kernel = f"{KERNEL} of {rollout.compiler}"
+        return rollout, kernel if rollout.uses_kernel else f"{SCAN} ({rollout.reason})"
     rollout = jaxpets.particle_rollout(
         model.sample, num_members=size.num_members, num_particles=search.num_particles
     )
-    return rollout, False
+    return rollout, SCAN
 
 
 def optimizer(

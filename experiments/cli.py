@@ -141,8 +141,8 @@ def _explored(config: Config) -> Config:
     data = rundir.read_json(path)
     # What an older version did not write is that of the run's preset and arm, not of
     # those that happen to be said again.
-    own = from_json(data, config)
-    explored = from_json(data, preset_config(own.preset, own.arm))
+    own = from_json(data, config, str(path))
+    explored = from_json(data, preset_config(own.preset, own.arm), str(path))
     return Config(**vars(part(explored, Science)), **vars(part(explored, Compute)))
 
 

@@ -30,9 +30,10 @@ class Mark(enum.Enum):
 
     EXPLORED = "part of an explored model, so that phase 2 cannot change it"
     COUNTED = "which runs and how many; the report says so beside its tables"
+    GOAL = "when a run is complete, which may be said anew"
 
 
-EXPLORED, COUNTED = Mark
+EXPLORED, COUNTED, GOAL = Mark
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Trials = Annotated[int, Meta(ge=1, le=100_000)]
 TaskTrials = Annotated[int, Meta(ge=1, le=10_000)]
@@ -132,8 +133,8 @@ class Basics:
     engine: EngineName = "mjx"
     """What steps the physics: mjx on the device of the program, or mujoco, which is C
     on the cores of the host."""
-    num_trials: Annotated[Trials, EXPLORED, COUNTED] = 60
-    """Exploration trials, the random ones included."""
+    num_trials: Annotated[Trials, EXPLORED, COUNTED, GOAL] = 60
+    """Exploration trials, the random ones included; a run may be given more later."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -124,8 +124,13 @@ def to_json(config: Any) -> Any:
     return msgspec.json.decode(msgspec.json.encode(config, enc_hook=str))
 
 
-def from_json(data: Any, default: Config) -> Config:
+def from_json(data: Any, default: Config, where: str = "config.json") -> Config:
     """Returns the config that `to_json` wrote; what it lacks is taken from default.
+
+    Args:
+      data: of a file, or of any origin.
+      default: the entries that are not there.
+      where: what an error calls the file.
 
     Raises:
       CheckpointError: if an entry is not valid, or this version does not know it.
@@ -133,30 +138,39 @@ def from_json(data: Any, default: Config) -> Config:
 
     def refuse(name: str, value: Any, wanted: str | None) -> Exception:
         if wanted is None:
-            return CheckpointError(f"config.json has an unknown entry {name!r}.")
+            return CheckpointError(
+                f"{where} has an unknown entry {name!r}. Use the version that wrote it."
+            )
         entry = f"{name} is" if name else "it is"
-        return CheckpointError(f"config.json: {entry} {value!r}, not {wanted}.")
+        return CheckpointError(f"{where}: {entry} {value!r}, not {wanted}.")
 
     return read(Config, data, default, refuse)
 
 
-def differences(old: Any, new: Any) -> list[str]:
+def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
     """Returns where two configs in JSON are not of the same run: `entry: old vs new`.
 
+    Which trial completes it may change.
+
     An entry that `old` lacks, because an older version wrote it, was what is now the
-    default. A group of entries that it lacks cannot differ.
+    default. A group of entries that it lacks cannot differ. `where` is what an error
+    calls the file of `old`.
 
     Raises:
       CheckpointError: if one of them cannot be read.
     """
-    now, then = from_json(new, Config()), from_json(old, Config())
+    now, then = from_json(new, Config()), from_json(old, Config(), where)
     unsaid = {
         name: getattr(now, name)
         for name, hint in hints(Config).items()
         if dataclasses.is_dataclass(hint) and name not in old
     }
     then = dataclasses.replace(then, **unsaid)
-    pairs = {entry.name: (entry.of(then), entry.of(now)) for entry in entries(Run)}
+    pairs = {
+        entry.name: (entry.of(then), entry.of(now))
+        for entry in entries(Run)
+        if Mark.GOAL not in entry.marks
+    }
     return [
         f"{name}: {to_json(pair[0])} (there) vs {to_json(pair[1])} (now)"
         for name, pair in sorted(pairs.items())

@@ -4,10 +4,22 @@ import contextlib
 from collections.abc import Iterator
 
 
+def printable(text: str) -> str:
+    """Returns lines that a terminal shows as they are: it obeys nothing in them.
+
+    A name or a text from the folder of a stranger may hold control characters.
+    """
+    safe = (x if x == "\n" or x.isprintable() else ascii(x)[1:-1] for x in text)
+    return "".join(safe)
+
+
 class RunError(Exception):
     """A failure that is not a bug; its message is one line for the user."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return printable(super().__str__()).replace("\n", "\\n")
 
 
 class UsageError(RunError):
@@ -44,6 +56,28 @@ class InterruptedRun(RunError):
     """A signal; the same command goes on from the last checkpoint."""
 
     exit_code = 75
+
+
+class StoppedTogether(InterruptedRun):
+    """A signal that all processes know of, and stop for at the same point."""
+
+
+def last_line(error: RunError) -> str:
+    """Returns what the user is told of the end of a run."""
+    if isinstance(error, InterruptedRun):
+        return (
+            f"stopped: {error}; at most the trial under way is lost. Continue with the "
+            "same command."
+        )
+    return f"error: {error}"
+
+
+def reason(error: BaseException) -> str:
+    """Returns in one line why a run ended."""
+    if isinstance(error, RunError):
+        return str(error)
+    line, *_ = [*str(error).splitlines(), ""]
+    return f"{type(error).__name__}: {line}".rstrip(": ")
 
 
 @contextlib.contextmanager

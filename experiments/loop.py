@@ -51,9 +51,21 @@ class Phase(Protocol):
 
 
 def run(
-    folder: RunFolder, phase: Phase, init: State, first: int, last: int
-) -> Trials | None:
-    """Runs trials `first + 1` to `last`, or what is left of them; saves after each."""
+    folder: RunFolder, phase: Phase, state: State, first: int, done: int, last: int
+) -> bool:
+    """Runs what is left of the trials `first + 1` to `last`; saves after each.
+
+    Args:
+      folder: of the run.
+      phase: what to do.
+      state: of the learners after trial `done`.
+      first: the trial before the first of this run.
+      done: the last one that is saved, `first` if none is.
+      last: the one that completes the run.
+
+    Returns:
+      Whether anything was left.
+    """
 
     def place(tree: Any) -> Any:
         return devices.place(phase.placement, tree, *phase.axes)
@@ -61,11 +73,10 @@ def run(
     def collect(tree: Any) -> Any:
         return devices.collect(phase.placement, tree, *phase.axes)
 
-    done, state = folder.resume(init) or (first, init)
     if done >= last:
         folder.say(f"already complete: {last - first} of {last - first} trials.")
-        return None
-    state, trials, steps = place(state), None, phase.trial_length
+        return False
+    state, steps = place(state), phase.trial_length
     progress = Progress((last - first) * steps, (done - first) * steps, phase.name)
     with progress.interruptible():
         for trial in range(done + 1, last + 1):
@@ -83,8 +94,14 @@ def run(
             timed = [{**row, "seconds": seconds} for row in rows]
             folder.record(trial, timed, learned, finite=(learned.params, learned.fit))
             text = f"{phase.name} {trial}/{last}  {records.describe(rows)}"
-            progress.line(f"{text}  {sum(seconds.values()):.1f} s")
-    return trials
+            text = f"{text}  {sum(seconds.values()):.1f} s"
+            progress.line(text)
+            rate, left = progress.pace()
+            folder.update(
+                trial=trial, num_trials=last, line=text,
+                steps_per_second=rate, seconds_left=left,
+            )  # fmt: skip
+    return True
 
 
 def over_branches(placement: Placement, learner: jaxpets.Learner, *axes: str) -> Learn:

@@ -6,7 +6,7 @@ trials are the leading axes of every array.
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -14,11 +14,12 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import acting, loop, records
+from experiments import acting, exploration, loop, records
 from experiments.acting import Actors, Tick, Trials
 from experiments.build import (
     EXPLORE,
     FINETUNE,
+    SCAN,
     ZERO_SHOT,
     Learn,
     Parts,
@@ -116,6 +117,7 @@ class _Finetuning:
 def explore(config: Config, run: RunFolder) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
+    _say_rollout(run, parts.explored_by)
     placement = _placement(run, len(config.seeds))
     length, horizon = config.chunk_length, config.planner.horizon
     phase = _Exploration(
@@ -125,13 +127,20 @@ def explore(config: Config, run: RunFolder) -> None:
         planned=acting.explorers(parts.env, parts.explorer, horizon, length, placement),
         learn=loop.over_branches(placement, parts.learner, SEED),
     )
-    init = jax.jit(jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES))(
-        phase.keys(0)
-    )
-    last = config.num_trials
-    trials = loop.run(run, phase, init, 0, last)
-    data = data_of(explored_template(config, parts))
-    coverage.write(run, config.seeds, data, last, anew=trials is not None)
+    last, saved = config.num_trials, exploration.as_saved(config, parts)
+    if found := run.resume(saved):
+        done, state = found
+        capacity = last * config.trial_length
+        state = exploration.with_room(state, capacity, parts.reward_data)
+    else:
+        init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
+        done, state = 0, jax.jit(init)(phase.keys(0))
+    went_on = loop.run(run, phase, state, 0, done, last)
+
+    def data(leaves: Mapping[str, Any]) -> State:
+        return exploration.data_of(saved(leaves))
+
+    coverage.write(run, config.seeds, data, max(done, last), anew=went_on)
 
 
 def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
@@ -139,14 +148,14 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
 
     The jump-start of Table 1. The model that acts is saved beside its log.
     """
-    if run.has_log():  # written once, at the end
-        run.say(
-            f"already complete: {config.eval_trials} of {config.eval_trials} trials."
-        )
+    names, weights = _tasks(config)
+    count = config.eval_trials
+    if run.performed(len(config.seeds) * len(names) * count):
+        run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
+    _say_rollout(run, parts.performed_by)
     model = _model(config, source, run, step, parts)
-    names, weights = _tasks(config)
     placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
     actors = acting.evaluators(
         parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
@@ -173,7 +182,8 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
         for trial in range(config.eval_trials)
     ]
     rows = records.rows(labels, trials)
-    run.save_trajectories(**records.trajectories(trials, config.seeds, names))
+    paths = records.trajectories(trials.transitions, config.seeds, names)
+    run.save_trajectories(paths)
     run.log(rows)
     run.say(records.summary(rows, names, time.monotonic() - begin))
 
@@ -184,6 +194,7 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
     """
     parts = build(config)
+    _say_rollout(run, parts.performed_by)
     names, weights = _tasks(config)
     placement = _placement(run, len(config.seeds), len(names))
     phase = _Finetuning(
@@ -198,48 +209,51 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         weights=devices.place(placement, weights, TASK),
         explored=step,
     )  # fmt: skip
-    explored = source.restore_trial(step, explored_template(config, parts))
+    state = source.restore_trial(step, exploration.as_saved(config, parts))
     if parts.refitter and not run.steps():
-        explored = refit(config, parts, explored, step, run)
-    capacity = explored.dataset.data.obs.shape[1]
+        state = refit(config, parts, state, step, run)
+    capacity = state.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
-    init = _branch(explored, len(names), capacity)
-    trials = loop.run(run, phase, init, step, step + config.finetune_trials)
-    if trials is not None:
-        trials = jax.tree.map(lambda x: x[:, :, None], trials)
-        run.save_trajectories(**records.trajectories(trials, config.seeds, names))
-
-
-def explored_template(config: Config, parts: Parts) -> State:
-    """Returns what exploration saves, `[S]`, as shapes."""
-    init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
-    return jax.eval_shape(init, trial_keys(config, EXPLORE, 0))
-
-
-def model_of(state: State) -> State:
-    """Returns what planning needs of a learner, with nothing in the other places."""
-    return jax.tree.map(lambda _: None, state)._replace(params=state.params)
-
-
-def data_of(state: State) -> State:
-    """Returns the dataset of a learner, with nothing in the other places."""
-    return jax.tree.map(lambda _: None, state)._replace(dataset=state.dataset)
+    init = _branch(state, len(names), capacity)
+    data = exploration.data_of(jax.eval_shape(lambda: init))
+    last = step + config.finetune_trials
+    done, state = run.resume(init, step) or (step, init)
+    went_on = loop.run(run, phase, state, step, done, last)
+    if went_on or not run.has_trajectories():
+        if not went_on:
+            run.say(f"{run.trajectories} is not whole: made again.")
+        # The last checkpoint holds the trial, so that no stop can lose it.
+        dataset = run.restore_trial(last, data, part=True).dataset
+        rows = slice(int(dataset.size) - config.task_length, int(dataset.size))
+        shown = jax.tree.map(lambda x: x[:, :, None, rows], dataset.data)
+        run.save_trajectories(records.trajectories(shown, config.seeds, names))
 
 
 def _model(
     config: Config, source: RunFolder, run: RunFolder, step: int, parts: Parts
 ) -> State:
     """Returns the model `[S]` to plan tasks with, from a stopped run or made anew."""
-    whole = explored_template(config, parts)
-    if found := run.restore(model_of(whole)):
+    template = exploration.model_of(exploration.template(config, parts))
+    if found := run.restore(template):
         return found[1]
     if parts.refitter:
-        state = source.restore_trial(step, whole)
-        model = model_of(refit(config, parts, state, step, run))
+        state = source.restore_trial(step, exploration.as_saved(config, parts))
+        model = exploration.model_of(refit(config, parts, state, step, run))
     else:  # all but the model may be missing there
-        model = source.restore_trial(step, model_of(whole), part=True)
+        model = source.restore_trial(step, template, part=True)
     run.save(step, model)
     return model
+
+
+def _say_rollout(run: RunFolder, rollout: str) -> None:
+    """Warns where numbers may be others than those so far, or come slowly."""
+    lines = [
+        f"{line}; the last bits may differ" for line in run.computes(rollout=rollout)
+    ]
+    if not lines and rollout.startswith(f"{SCAN} ("):
+        lines = [f"planning takes twice as long as in a kernel: it is a {rollout}"]
+    for line in lines:
+        run.say(f"warning: {line}")
 
 
 def _placement(run: RunFolder, *counts: int) -> Placement:
@@ -252,9 +266,7 @@ def _placement(run: RunFolder, *counts: int) -> Placement:
 
 def _branch(state: State, num_tasks: int, capacity: int) -> State:
     """Copies the learner `[S]` once per task, `[S, K]`, with room for more data."""
-    axes = jaxpets.SEED_AXES.dataset
-    grown = jax.vmap(lambda data: jaxpets.datasets.grow(data, capacity), (axes,), axes)
-    state = state._replace(dataset=grown(state.dataset), reward=())
+    state = exploration.with_room(state, capacity)._replace(reward=())
 
     def repeat(x: Array) -> Array:
         shared = x.ndim == 0

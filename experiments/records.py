@@ -12,6 +12,10 @@ from experiments.errors import DivergedError
 from experiments.storage import metrics
 from jaxpets.envs import half_cheetah
 
+# No plan is worth as little but one whose candidates all have the worst value, which is
+# shared by at most 1000 steps.
+_NO_VALUE = jaxpets.optimizers.WORST_VALUE / 1e4
+
 
 def check_finite(trials: Trials, trial: int) -> None:
     """Raises DivergedError if the simulator left the finite numbers."""
@@ -37,7 +41,8 @@ def rows(
       params: the model after fitting, with the same leading axes.
     """
     returns, turns = score(trials.transitions)
-    value = np.asarray(trials.values).mean(axis=-1)
+    values = np.asarray(trials.values)
+    value, bad = values.mean(axis=-1), (values < _NO_VALUE).sum(axis=-1)
     flat_returns = np.asarray(returns).reshape(-1, len(half_cheetah.TASK_NAMES))
     table = []
     for i, label in enumerate(labels):
@@ -46,7 +51,9 @@ def rows(
         )
         own = None if fit is None or params is None else _fit(fit, params, i)
         net = np.asarray(turns).flat[i].item()
-        table.append(metrics.row(label, value.flat[i].item(), net, named, own))
+        row = metrics.row(label, value.flat[i].item(), net, named, own)
+        count = bad.flat[i].item()
+        table.append(row | {"bad_plans": count} if count else row)
     return table
 
 
@@ -62,15 +69,15 @@ def _fit(
 
 
 def trajectories(
-    trials: Trials, seeds: Sequence[int], tasks: Sequence[str]
+    transitions: jaxpets.Transition, seeds: Sequence[int], tasks: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """Returns the observations of trials `[S, K, R, T, *]` and what they belong to."""
-    returns, _ = score(trials.transitions)
+    returns, _ = score(transitions)
     columns = [half_cheetah.TASK_NAMES.index(task) for task in tasks]
     own = [np.asarray(returns)[:, k, :, c] for k, c in enumerate(columns)]
     return {
-        "obs": np.asarray(trials.transitions.next_obs),
-        "action": np.asarray(trials.transitions.action),
+        "obs": np.asarray(transitions.next_obs),
+        "action": np.asarray(transitions.action),
         "seeds": np.asarray(seeds),
         "tasks": np.asarray(tasks),
         "returns": np.stack(own, 1),
@@ -88,7 +95,9 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
         if own:
             parts.append(f"{name} {np.mean(own):.0f}")
     value = np.mean([row["value"] for row in rows])
-    return "  ".join([f"value {value:.3g}", "returns:", *parts])
+    text = "  ".join([f"value {value:.3g}", "returns:", *parts])
+    bad = sum(row.get("bad_plans", 0) for row in rows)
+    return f"{text}  bad plans: {bad}" if bad else text
 
 
 def summary(

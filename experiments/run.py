@@ -3,12 +3,13 @@
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from experiments import cli
+from experiments import cli, signals
 from experiments.config import NUM_TASKS, Config
 from experiments.cost import check_cpu, memory_advice
 from experiments.entries import differences, from_json, to_json
@@ -19,9 +20,9 @@ from experiments.errors import (
     RunError,
     StorageError,
     UsageError,
+    last_line,
 )
 from experiments.parallel import distributed
-from experiments.progress import stoppable
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
     from experiments.storage.folder import RunFolder
@@ -40,16 +41,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-        with distributed.joined(cli.process_spec(arguments)):
+        with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
             plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config)
-    except RunError as error:
+    except (RunError, KeyboardInterrupt) as end:
         if "--debug" in arguments:
             traceback.print_exc()
-        kind = "stopped" if isinstance(error, InterruptedRun) else "error"
-        print(f"{kind}: {error}", file=sys.stderr)
+        # There may be no run yet that turns a signal into an error.
+        error = end if isinstance(end, RunError) else InterruptedRun("SIGINT")
+        signals.say(last_line(error))
         return error.exit_code
     return 0
 
@@ -107,7 +109,14 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     if (config.phase, config.task) == ("finetune", "all"):
         branches *= NUM_TASKS
     size = _NEEDED_BYTES * branches
-    with stoppable(), folder.open_run(path, plain, differences, size) as run:
+    with (
+        signals.stoppable() as late,
+        folder.open_run(path, plain, differences, size) as run,
+        _plain_errors(config),
+    ):
+        if distributed.is_first() and not distributed.is_alone():
+            late.seconds += 0.5  # the others first: jax aborts them when this one goes
+        late.tell = run.interrupted
         yield run
 
 
@@ -156,11 +165,27 @@ def _plain_errors(config: Config) -> Iterator[None]:
     except MemoryError as error:
         raise OutOfMemoryError(memory_advice(config)) from error
     except OSError as error:
-        raise StorageError(f"{error.strerror} ({error.filename}).") from error
+        doing = f"use {error.filename}" if error.filename else "go on"
+        raise StorageError(
+            f"cannot {doing} ({error.strerror or error}). Check the disk, and what "
+            "reads the output, and run the same command."
+        ) from error
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         raise OutOfMemoryError(memory_advice(config)) from error
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Shows warnings as a line each, without the source that they come from."""
+
+    def show(message: Warning | str, *_: Any) -> None:
+        distributed.say(f"warning: {message}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager
@@ -179,5 +204,16 @@ def _without_gl() -> Iterator[None]:
             os.environ["MUJOCO_GL"] = chosen
 
 
+def _command() -> NoReturn:
+    code: Any = 1
+    try:
+        code = main()
+    except SystemExit as error:
+        code = error.code
+    except BaseException:
+        traceback.print_exc()
+    signals.leave(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    _command()

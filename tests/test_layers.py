@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -252,6 +253,48 @@ def test_orbax_has_one_home():
         if any(x.split(".")[0] == "orbax" for x in imports(ast.parse(path.read_text())))
     }
     assert found == ORBAX
+
+
+# Who may write a file where it stands: the writer itself, which also opens what is
+# appended to, and the seal of a checkpoint that is still a draft.
+WRITERS = {"storage.disk", "storage.step_folders"}
+WRITING = {
+    "write_text", "write_bytes", "savez", "savez_compressed", "savefig", "copy",
+    "copy2", "copyfile", "write_frames",
+}  # fmt: skip
+
+
+def writes(tree):
+    """Returns the calls that write a file which is no draft."""
+    found, drafts = [], {"target"}  # a target is what a caller has given
+    for node in ast.walk(tree):
+        match node:
+            case ast.withitem(
+                ast.Call(ast.Attribute(attr="replaced" | "draft")), ast.Name(id)
+            ):
+                drafts.add(id)
+            case _:
+                pass
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func).rpartition(".")[2]
+        words = [x.value for x in call.args if isinstance(x, ast.Constant)]
+        mode = any(set(str(word)) & set("wax+") for word in words)
+        if name in WRITING or (name == "open" and mode):
+            text = ast.unparse(call)
+            if not drafts & set(re.findall(r"\w+", text)):
+                found.append(text)
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS.keys() - WRITERS))
+def test_files_are_replaced_at_once(name):
+    assert not writes(ast.parse(path_of(name).read_text()))
+
+
+def test_writing_is_seen():
+    assert all(writes(ast.parse(path_of(name).read_text())) for name in WRITERS)
+    torn = "np.savez(path, x=1); file.open('rb'); open(path, 'w').write('x')"
+    assert len(writes(ast.parse(torn))) == 2
 
 
 @pytest.mark.parametrize("name", sorted(EXPERIMENTS))

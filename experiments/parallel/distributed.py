@@ -4,10 +4,8 @@ Process 0 has the run's folder and the screen. What it reads, decides or fails a
 to the others through here, so that all of them go on, stop or end together.
 """
 
-import atexit
 import contextlib
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
@@ -17,7 +15,15 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from experiments import errors
-from experiments.errors import OutOfMemoryError, RunError, UsageError
+from experiments.errors import (
+    InterruptedRun,
+    OutOfMemoryError,
+    RunError,
+    StoppedTogether,
+    UsageError,
+)
+
+_CONNECTIONS = ("Gloo", "NCCL")  # what carries an exchange; its errors have the name
 
 
 class ProcessSpec(NamedTuple):
@@ -31,7 +37,7 @@ class ProcessSpec(NamedTuple):
 def say(text: str) -> None:
     """Prints a line for the user, once for all processes."""
     if is_first():
-        print(text, file=sys.stderr, flush=True)
+        print(errors.printable(text), file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
@@ -61,19 +67,22 @@ def joined(spec: ProcessSpec | None) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        if not isinstance(error, RunError) or isinstance(error, OutOfMemoryError):
-            # The others know nothing of it and wait for us: jax ends them once we are
-            # gone, but at exit it would wait for them first.
-            atexit.register(os._exit, getattr(error, "exit_code", 1))
-            raise
-        _leave()
-        raise
+        if _is_known_to_all(error):
+            _leave()
+        raise  # else the others wait for us, and end once we are gone
     _leave()
 
 
+def _is_known_to_all(error: BaseException) -> bool:
+    if isinstance(error, InterruptedRun):
+        return isinstance(error, StoppedTogether)
+    return isinstance(error, RunError) and not isinstance(error, OutOfMemoryError)
+
+
 def _leave() -> None:
-    agree(0)  # process 0 may have been busy for longer than a shutdown waits
-    jax.distributed.shutdown()
+    with contextlib.suppress(InterruptedRun):
+        agree(0)  # process 0 may have been busy for longer than a shutdown waits
+        jax.distributed.shutdown()
 
 
 def is_alone() -> bool:
@@ -137,7 +146,7 @@ def share(tree: Any) -> Any:
 def gather(tree: Any) -> Any:
     """Returns the NumPy arrays of all processes, `[processes, ...]`, to all."""
     leaves, structure = jax.tree.flatten(tree)
-    every = multihost_utils.process_allgather(_packed(leaves))
+    every = _from_all(_packed(leaves))
     return structure.unflatten(_unpacked(every, leaves))
 
 
@@ -145,11 +154,31 @@ def agree(number: int) -> int:
     """Returns the largest number that any process has brought."""
     if is_alone():
         return number
-    return int(multihost_utils.process_allgather(np.array(number, np.int32)).max())
+    return int(_from_all(np.array(number, np.int32)).max())
 
 
 def _from_first(array: np.ndarray) -> np.ndarray:
-    return multihost_utils.broadcast_one_to_all(array)
+    with _with_others():
+        return multihost_utils.broadcast_one_to_all(array)
+
+
+def _from_all(array: np.ndarray) -> np.ndarray:
+    with _with_others():
+        return multihost_utils.process_allgather(array)
+
+
+@contextlib.contextmanager
+def _with_others() -> Iterator[None]:
+    """Stops this process, as a signal does, where another one no longer answers."""
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # as jax has both
+        if not any(name in str(error) for name in _CONNECTIONS):
+            raise
+        other = "another process"
+        if jax.process_count() == 2:
+            other = f"process {1 - jax.process_index()}"
+        raise InterruptedRun(f"{other} is gone") from error
 
 
 def _packed(arrays: Iterable[np.ndarray]) -> np.ndarray:

@@ -70,7 +70,7 @@ def write(
     Raises:
       CheckpointError, StorageError: if the one cannot be read or the other written.
     """
-    if run.has(_FILE) and not anew:
+    if run.has_json(_FILE) and not anew:
         return
     dataset = run.restore_trial(step, template, part=True).dataset
     filled = np.asarray(dataset.data.next_obs)[:, : int(dataset.size)]
@@ -108,12 +108,18 @@ def load(out: Path) -> dict[str, dict[str, Counts]]:
 
 def _read(path: Path) -> _Found:
     data = rundir.find_json(path)
-    config = rundir.find_json(path.parent / rundir.CONFIG)
+    config = logs.config(path.parent)
     try:
         edges = tuple(data["velocity_edges"]), tuple(data["pitch_rate_edges"])
         counts = {int(seed): np.array(x, int) for seed, x in data["counts"].items()}
         arm, preset = metrics.arm_label(config["arm"], config), config["preset"]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (
+        ArithmeticError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+    ) as error:
         raise UsageError(f"{path} is no coverage of a run ({error!r}).") from error
     shape = len(VELOCITY_EDGES) - 1, len(PITCH_RATE_EDGES) - 1
     fits = edges == (VELOCITY_EDGES, PITCH_RATE_EDGES)

@@ -4,28 +4,41 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from experiments.errors import UsageError
+from experiments.errors import CheckpointError, UsageError
 from experiments.storage import metrics, rundir
 from experiments.storage.metrics import Row, number
+from experiments.storage.rundir import Name
 
 Points = dict[int, dict[int, float]]  # trial -> seed -> number
 Scores = dict[str, dict[str, dict[int, float]]]  # arm -> task -> seed -> score
 
 
+class _Labels(msgspec.Struct):
+    """What the report reads of a config; some of it gets into names of files."""
+
+    preset: Name
+    arm: Name = "epistemic"
+    task: Name = "all"
+    tag: Name | None = None
+    num_bits: int = 0
+
+
 def load(out: Path) -> list[Row]:
     """Reads every metrics.jsonl under a folder, hidden ones left out.
 
-    A last line without its end is left out too: a run is writing it, or was killed
-    while it did. So is what a run did for one task where it did the same for all.
+    Lines that are no rows are left out too, as `metrics.read` says. So is what a run
+    did for one task where it did the same for all.
 
     Raises:
-      UsageError: if there is no log, a line that is no row, or two rows for one seed,
-        task and trial of an arm: averaging them would count a seed twice.
+      UsageError: if there is no log, or two rows for one seed, task and trial of an
+        arm: averaging them would count a seed twice.
+      CheckpointError: as `config`.
     """
     logs = [log for log in files(out, rundir.METRICS) if not _is_part(log)]
-    rows = [row for log in logs for row in metrics.read(log, _config(log.parent))]
+    rows = [row for log in logs for row in metrics.read(log, config(log.parent))]
     if not rows:
         raise UsageError(f"there is no metrics.jsonl with a row under {out}.")
     seen: dict[tuple[Any, ...], Row] = {}
@@ -53,15 +66,29 @@ def files(out: Path, name: str) -> list[Path]:
 def _is_part(log: Path) -> bool:
     """Tells if the folder beside this one has done all tasks, this one among them."""
     folder = log.parent
-    task = _config(folder).get("task", "all")
+    task = config(folder).get("task", "all")
     if task == "all":
         return False
     whole = folder.with_name(folder.name.replace(f"-{task}", "", 1)) / log.name
     return whole != log and whole.exists() and whole.stat().st_size > 0
 
 
-def _config(folder: Path) -> dict[str, Any]:
-    return rundir.find_json(folder / rundir.CONFIG)
+def config(folder: Path) -> dict[str, Any]:
+    """Returns the config of a run, in JSON.
+
+    Raises:
+      CheckpointError: if there is none, or one that no run can have.
+    """
+    path = folder / rundir.CONFIG
+    found = rundir.read_json(path)
+    try:
+        msgspec.convert(found, _Labels)
+    except msgspec.ValidationError as error:
+        raise CheckpointError(
+            f"{path} is no config of a run ({error}). Restore it, or move its folder "
+            "elsewhere."
+        ) from None
+    return found
 
 
 def named_by_tag(rows: Iterable[Row]) -> list[Row]:

@@ -28,6 +28,7 @@ from experiments.report.logs import (
     tuning,
 )
 from experiments.report.tables import TASKS
+from experiments.storage import disk
 
 __all__ = ["load", "write_report"]
 
@@ -127,7 +128,7 @@ def _write(
         *_ablation(out / "ablation.jsonl"),
         *_runs(every, out),
     ]
-    files.report.write_text("\n".join(lines))
+    disk.write(files.report, "\n".join(lines).encode())
 
 
 def _draw(rows: Sequence[Row], found: Scores, explored: int, files: _Files) -> None:
@@ -162,7 +163,8 @@ def _write_json(path: Path, found: Scores) -> None:
                 "iqm": summary.iqm if summary else None,
                 "ci95": list(summary.ci95) if summary and summary.ci95 else None,
             }
-    path.write_text(json.dumps(table, indent=1, allow_nan=False) + "\n")
+    text = json.dumps(table, indent=1, allow_nan=False) + "\n"
+    disk.write(path, text.encode())
 
 
 def _curves(points: Mapping[str, Points]) -> dict[str, Curve]:

@@ -8,6 +8,8 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from experiments.storage import disk
+
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 BLUE = "#0072B2"
 ORANGE = "#E69F00"
@@ -63,8 +65,8 @@ def new_figure(width: float, height: float) -> Figure:
 def save(figure: Figure, target: Path) -> None:
     """Writes a PNG or SVG; without date and version, equal data give equal files."""
     svg = target.suffix == ".svg"
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE), disk.replaced(target) as draft:
         figure.savefig(
-            target,
+            draft,
             metadata={"Date": None, "Creator": None} if svg else {"Software": None},
         )

@@ -141,7 +141,8 @@ def _random_actions(rows: Sequence[Row]) -> list[str]:
     }.values()
     means = []
     for task in TASKS:
-        values = np.array([number(row.data["returns"][task]) for row in random])
+        values = [(row.data.get("returns") or {}).get(task) for row in random]
+        values = np.array([*map(number, values)])
         if np.isfinite(values).any():
             mean = tables.format_number(float(np.nanmean(values)))
             means.append(f"{task} {mean}")

@@ -39,6 +39,14 @@ _FIRST = ocp.options.MultiprocessingOptions(0, {0}, "first")  # no other host is
 class _DamagedError(Exception):
     """A step that is not what was written; the message says where."""
 
+    kind = "damaged"
+
+
+class _ForeignError(_DamagedError):
+    """A step that was written, but not here; the message says by whom."""
+
+    kind = "foreign"
+
 
 def save(
     directory: Path, step: int, state: Any, meta: Mapping[str, Any], *,
@@ -77,7 +85,7 @@ def save(
     size = 200_000 + sum(x.nbytes for x in arrays.values())  # orbax compresses them
     kept = [policies.LatestN(keep), policies.CustomSteps(list(milestones))]
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        disk.make(directory)
         step_folders.sweep(directory)
         if disk.free_bytes(directory) < size:
             # Orbax would find out too, after pages of its threads' tracebacks.
@@ -96,45 +104,50 @@ def save(
 def restore(
     directory: Path, template: Any, *,
     step: int | None = None, part: bool = False, warn: Callable[[str], None],
+    foreign: Callable[[dict[str, Any]], str | None] = lambda _: None,
 ) -> tuple[int, Any, dict[str, Any]] | None:  # fmt: skip
     """Returns the newest step that is undamaged, or exactly `step`: it, state and meta.
 
-    Damaged steps newer than the one read are set aside as `.corrupt-<step>`, with one
-    warning each. If none can be read, none is moved: the directory is not a new one.
-    None if there is no checkpoint at all.
+    Steps newer than the one read, which are damaged or another's, are set aside as
+    `.damaged-<step>` or `.foreign-<step>`, with one warning each. If none can be read,
+    none is moved: the directory is not a new one. None if there is no checkpoint at
+    all.
 
     Args:
       directory: as in `save`.
-      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device.
+      template: the state's pytree; arrays or `jax.ShapeDtypeStruct`s, on any device. Or
+        a function that returns it, of what `pytrees.describe` said of what was saved.
       step: the one to read, or None for the newest.
       part: whether the template may be a part of what was saved, with the same paths.
       warn: gets each warning as one line.
+      foreign: says of a step's meta whose it is, if it is not ours.
 
     Raises:
       CheckpointError: if nothing there can be used; the message says why.
     """
     directory = Path(directory).resolve()
-    damaged: dict[int, str] = {}
+    refused: dict[int, _DamagedError] = {}
     for number in [n for n in names(directory)[::-1] if step in (None, n)]:
         try:
-            state, meta = _read(directory, number, template, part)
+            state, meta = _read(directory, number, template, part, foreign)
         except _DamagedError as error:
-            damaged[number] = str(error)
+            refused[number] = error
             continue
-        for bad, why in damaged.items():
-            fate = step_folders.quarantine(directory, bad)
-            warn(f"checkpoint {bad} is damaged ({why}); {fate}, using {number}.")
+        for bad, why in refused.items():
+            fate = step_folders.quarantine(directory, bad, why.kind)
+            warn(f"checkpoint {bad} is {why.kind} ({why}); {fate}, using {number}.")
         return number, state, meta
     if step is not None:
         others = _listed([number for number in steps(directory) if number != step])
         what = f"checkpoint {step} in {directory}"
-        what = f"{what} is damaged ({damaged[step]})" if damaged else f"no {what}"
+        why = refused.get(step)
+        what = f"{what} is {why.kind} ({why})" if why else f"no {what}"
         raise CheckpointError(f"{what}. Choose another (there: {others}).")
-    if damaged:
-        reasons = "; ".join(f"{number}: {why}" for number, why in damaged.items())
+    if refused:
+        whys = (f"{number} is {why.kind}: {why}" for number, why in refused.items())
         raise CheckpointError(
-            f"all {len(damaged)} checkpoints in {directory} are damaged ({reasons}). "
-            "Start over in another run directory; the files were kept."
+            f"no checkpoint in {directory} can be used ({'; '.join(whys)}). Start over "
+            "in another run directory; the files were kept."
         )
     return None
 
@@ -197,7 +210,10 @@ def _what_failed(error: Exception, directory: Path, step: str, size: int) -> str
     return f"{reason} {step} in {directory} (needs {needs}, {free} free)"
 
 
-def _read(directory: Path, number: int, template: Any, part: bool) -> tuple[Any, Any]:
+def _read(
+    directory: Path, number: int, template: Any, part: bool,
+    foreign: Callable[[dict[str, Any]], str | None],
+) -> tuple[Any, dict[str, Any]]:  # fmt: skip
     """Returns state and meta of one step; raises CheckpointError if it does not fit."""
     meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
     state = ocp.args.Composite(state=ocp.args.StandardRestore())
@@ -208,6 +224,10 @@ def _read(directory: Path, number: int, template: Any, part: bool) -> tuple[Any,
             record = manager.restore(number, args=meta)["meta"]
             if record["step"] != number:
                 raise _DamagedError(f"it is step {record['step']}")
+            if whose := foreign(record["meta"]):
+                raise _ForeignError(whose)
+            if callable(template):
+                template = template(record["leaves"])
             if why := _misfit(record, template, part):
                 raise CheckpointError(f"checkpoint {number} in {directory} {why}")
             arrays = manager.restore(number, args=state)["state"]

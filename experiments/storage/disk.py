@@ -1,9 +1,112 @@
 """Files that survive a power cut, and disk errors as one line for the user."""
 
+import contextlib
 import os
 import re
+import secrets
 import shutil
+import stat
+from collections.abc import Iterator
 from pathlib import Path
+
+from experiments.errors import StorageError, storage_errors
+
+_DRAFT = ".tmp-"
+
+
+@contextlib.contextmanager
+def draft(path: Path) -> Iterator[Path]:
+    """Yields a name beside a file that nothing has, and removes what it came to name.
+
+    It has the suffix of the file, from which libraries guess what to write.
+    """
+    name = path.with_name(f"{_DRAFT}{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield name
+    finally:
+        name.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yields a draft of a file, which takes its place at once when the block ends.
+
+    A reader sees the old file or the new one, after a power cut too; a failure leaves
+    the old one. A link there is replaced, not followed.
+
+    Raises:
+      StorageError: if the disk refuses.
+    """
+    with storage_errors(f"write {path}"):
+        with draft(path) as name:
+            yield name
+            sync(name)
+            name.replace(path)
+        sync(path.parent)
+
+
+def write(path: Path, data: bytes) -> None:
+    """Replaces a file, as `replaced` does."""
+    with replaced(path) as name:
+        name.write_bytes(data)
+
+
+def sweep(folder: Path) -> None:
+    """Removes the drafts of killed processes; nobody may be writing there."""
+    for name in folder.glob(f"{_DRAFT}*"):
+        with contextlib.suppress(OSError):
+            name.unlink()
+
+
+@contextlib.contextmanager
+def opened(path: Path, flags: int) -> Iterator[int]:
+    """Opens a file, made if need be, to write to it where it stands.
+
+    Raises:
+      StorageError: if the disk refuses, or as `check_own`.
+    """
+    check_own(path)
+    flags |= os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    with storage_errors(f"write {path}"):
+        file = os.open(path, flags, 0o666)
+    try:
+        yield file
+    finally:
+        os.close(file)
+
+
+def check_own(path: Path, *, folder: bool = False) -> None:
+    """Refuses to write to a file or a folder that also is elsewhere, as links are.
+
+    Args:
+      path: need not exist.
+      folder: whether it must be one.
+
+    Raises:
+      StorageError: if it is a link, hard or soft, or of another kind.
+    """
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return
+    if folder:
+        good = stat.S_ISDIR(status.st_mode)
+    else:
+        good = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+    if not good:
+        kind = "folder" if folder else "file"
+        raise StorageError(
+            f"{path} is a link, or no {kind}; a run writes to its own only. Put a copy "
+            "of what it stands for in its place, or move it away."
+        )
+
+
+def make(folder: Path) -> None:
+    """Makes a folder, and those that it is in; a power cut does not undo it."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync(path.parent)
 
 
 def sync(path: Path) -> None:

@@ -1,5 +1,6 @@
 """What besides the config decides a run's numbers: versions, device, flags of jax."""
 
+import contextlib
 import os
 import platform
 import subprocess
@@ -12,6 +13,7 @@ import jax
 
 import jaxpets
 from experiments.errors import CheckpointError
+from experiments.storage import rundir
 
 _PACKAGES = (
     "jax",
@@ -44,9 +46,33 @@ def environment() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "device_kind": device.device_kind,
         "device_count": jax.device_count(),
+        "processor": _processor(),
         **{name: getattr(jax.config, flag) for name, flag in _FLAGS.items()},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+def remember(path: Path, now: Mapping[str, Any]) -> list[str]:
+    """Keeps the environment that a run began in, and says what is another one now.
+
+    Args:
+      path: of its file; what it lacks is added, what it has stays.
+      now: entries of the environment.
+
+    Returns:
+      A line per difference.
+
+    Raises:
+      CheckpointError: as `compare_environment`, or if the file cannot be read.
+      StorageError: if it cannot be written.
+    """
+    began = rundir.read_json(path) if path.exists() else {}
+    if not isinstance(began, dict):
+        raise CheckpointError(f"{path} is not an object. Restore or remove it.")
+    lines = compare_environment(began, now)
+    if now.keys() - began.keys():
+        rundir.write_json(path, {**began, **now, **began})
+    return lines
 
 
 def compare_environment(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
@@ -77,6 +103,16 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+def _processor() -> str:
+    """Returns the model of the processor; results in float32 may depend on it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
 
 
 def _git_commit() -> str | None:

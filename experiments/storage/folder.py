@@ -5,21 +5,29 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.errors import CheckpointError, InterruptedRun, RunError
+from experiments import errors
+from experiments.errors import InterruptedRun, StorageError
 from experiments.parallel import distributed
-from experiments.storage import checkpoint, metrics, pytrees, rundir
-from experiments.storage.environment import compare_environment, environment
-
-# (of the start, of now) -> what differs between two configs in JSON.
-Differences = Callable[[Any, Any], list[str]]
+from experiments.storage import (
+    checkpoint,
+    disk,
+    identity,
+    metrics,
+    pytrees,
+    rundir,
+    status,
+    trajectories,
+)
+from experiments.storage.environment import environment, remember
+from experiments.storage.identity import Differences
+from experiments.storage.status import Writer
 
 
 class RunFolder(NamedTuple):
@@ -27,10 +35,15 @@ class RunFolder(NamedTuple):
 
     path: Path
     milestones: Sequence[int] = ()  # trials whose checkpoints are never dropped
+    # Of a run that is written to:
+    started: Mapping[str, Any] | None = None  # its config
+    differences: Differences = lambda then, now, where: []
+    status: Writer | None = None  # on process 0
 
     def say(self, text: str) -> None:
-        """Prints a line for the user."""
+        """Prints lines for the user; the last one gets into status.json."""
         distributed.say(text)
+        self.update(line=text.splitlines()[-1])
 
     # Reading.
 
@@ -42,13 +55,20 @@ class RunFolder(NamedTuple):
         """Returns the trials that have a checkpoint, oldest first."""
         return distributed.on_first(lambda: checkpoint.steps(self._checkpoints))
 
-    def has(self, name: str) -> bool:
-        """Returns whether there is a file of this name with something in it."""
-        return distributed.on_first(lambda: metrics.log_size(self.path / name) > 0)
+    def has_json(self, name: str) -> bool:
+        """Returns whether there is an object in a file of this name."""
+        return distributed.on_first(lambda: bool(rundir.find_json(self.path / name)))
 
-    def has_log(self) -> bool:
-        """Returns whether a row was logged."""
-        return self.has(rundir.METRICS)
+    def has_trajectories(self) -> bool:
+        """Returns whether what a video is made of is there, and whole."""
+        return distributed.on_first(lambda: trajectories.is_whole(self.trajectories))
+
+    def performed(self, num_rows: int) -> bool:
+        """Returns whether a phase that ends with so many rows has ended.
+
+        If it has and then lost a part, what is left of its log is set aside.
+        """
+        return distributed.on_first(lambda: self._performed(num_rows))
 
     def restore(self, template: Any, *, part: bool = False) -> tuple[int, Any] | None:
         """Returns trial and state of the last checkpoint, None before the first.
@@ -70,11 +90,21 @@ class RunFolder(NamedTuple):
         assert found is not None  # a trial that is asked for and not there is an error
         return found[1]
 
-    def resume(self, template: Any) -> tuple[int, Any] | None:
-        """Returns what `restore` does, and cuts off what was logged after it."""
+    def resume(self, template: Any, first: int = 0) -> tuple[int, Any] | None:
+        """Returns what `restore` does, and cuts off what was logged after it.
+
+        What the log has lost is said: it costs rows, never a run.
+
+        Args:
+          template: as in `checkpoint.restore`.
+          first: the trial before those of this run.
+        """
         found = self._restore(template, None, False)
-        size = found[2]["log"] if found else 0
-        distributed.on_first(lambda: metrics.cut_log(self._log, size))
+        last, meta = (found[0], found[2]) if found else (first, {})
+        for line in distributed.on_first(
+            lambda: metrics.resume(self._log, first, last, meta.get("rows"))
+        ):
+            self.say(f"warning: {line}")
         return found[:2] if found else None
 
     # Writing.
@@ -93,7 +123,7 @@ class RunFolder(NamedTuple):
 
         def write() -> None:
             metrics.append_rows(self._log, rows)
-            self._save(trial, state, {"log": metrics.log_size(self._log)}, finite)
+            self._save(trial, state, {"rows": len(rows)}, finite)
 
         distributed.on_first(write)
 
@@ -102,16 +132,39 @@ class RunFolder(NamedTuple):
         distributed.on_first(lambda: self._save(step, state, {}, state))
 
     def log(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Appends rows to the log."""
-        distributed.on_first(lambda: metrics.append_rows(self._log, rows))
+        """Writes the log of a phase that ends with it, all rows at once."""
+        distributed.on_first(lambda: metrics.replace_rows(self._log, rows))
 
-    def save_trajectories(self, **arrays: np.ndarray) -> None:
+    def save_trajectories(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes what a video is made of."""
-        distributed.on_first(lambda: self._save_trajectories(arrays))
+        distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
+
+    def computes(self, **entries: str) -> list[str]:
+        """Keeps what computes the run's numbers beside the rest of its environment.
+
+        Returns:
+          A line per entry that is another one than when the run began.
+        """
+        path = self.path / rundir.ENVIRONMENT
+        return distributed.on_first(lambda: remember(path, entries))
 
     def write_json(self, name: str, data: Any) -> None:
         """Replaces a JSON file."""
         distributed.on_first(lambda: rundir.write_json(self.path / name, data))
+
+    def update(self, **changes: Any) -> None:
+        """Puts into status.json how far the run is.
+
+        Args:
+          **changes: fields of `status.Status`.
+        """
+        if self.status is not None:
+            self.status.update(**changes)
+
+    def interrupted(self, reason: str) -> None:
+        """Puts into status.json that this process was stopped; any thread may."""
+        if self.status is not None:
+            self.status.end(status.INTERRUPTED, reason)
 
     @property
     def trajectories(self) -> Path:
@@ -133,32 +186,42 @@ class RunFolder(NamedTuple):
     ) -> tuple[int, Any, dict[str, Any]] | None:
         kept = []
 
-        def read() -> tuple[int, dict[str, Any]] | None:
+        def read() -> tuple[int, dict[str, Any], dict[str, Any]] | None:
             found = checkpoint.restore(
                 self._checkpoints, template, step=step, part=part,
-                warn=lambda line: self.say(f"warning: {line}"),
+                warn=lambda line: self.say(f"warning: {line}"), foreign=self._foreign,
             )  # fmt: skip
             if found is None:
                 return None
             kept.append(found[1])
-            return found[0], found[2]
+            return found[0], found[2], pytrees.describe(found[1])
 
         found = distributed.on_first(read)
         if found is None:
             return None
-        number, meta = found
-        return number, _shared(kept[0] if kept else None, template), meta
+        number, meta, leaves = found
+        like = template(leaves) if callable(template) else template
+        return number, _shared(kept[0] if kept else None, like), meta
+
+    def _foreign(self, meta: dict[str, Any]) -> str | None:
+        return identity.foreign(self.path, meta, self.started, self.differences)
 
     def _save(self, step: int, state: Any, meta: dict[str, Any], finite: Any) -> None:
         checkpoint.save(
-            self._checkpoints, step, state, meta,
+            self._checkpoints, step, state, meta | identity.of(self.path),
             finite=finite, milestones=self.milestones,
         )  # fmt: skip
 
-    def _save_trajectories(self, arrays: Mapping[str, Any]) -> None:
-        data = io.BytesIO()
-        np.savez_compressed(data, **arrays)
-        rundir.replace_file(self.trajectories, data.getvalue())
+    def _performed(self, num_rows: int) -> bool:
+        found = metrics.rows_by_trial(self._log).total()
+        whole = trajectories.is_whole(self.trajectories)
+        if found == num_rows and whole:
+            return True
+        if found or self.trajectories.exists():
+            what = self._log if found != num_rows else self.trajectories
+            self.say(f"warning: {what} is not whole: performing again.")
+        metrics.cut_log(self._log, 0)
+        return False
 
 
 @contextlib.contextmanager
@@ -177,55 +240,39 @@ def open_run(
       CheckpointError: if the folder is in use or belongs to another config.
       StorageError: if it cannot be written to.
     """
-    run = RunFolder(path, tuple(config["milestones"]))
-    held = _held(path, config, differences, needed_bytes)
+    writer = Writer(path, config["phase"])
+    held = _held(path, config, differences, needed_bytes, writer)
     with distributed.held_by_first(held):
-        yield run
+        own = writer if distributed.is_first() else None
+        yield RunFolder(path, tuple(config["milestones"]), config, differences, own)
 
 
 @contextlib.contextmanager
 def _held(
-    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
-) -> Iterator[None]:
-    rundir.probe(path, needed_bytes)
+    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
+    writer: Writer,
+) -> Iterator[None]:  # fmt: skip
     with rundir.lock(path):
+        disk.sweep(path)
+        rundir.probe(path, needed_bytes)
         _describe(path, config, differences)
-        _status(path, "running")
+        writer.begin()
         try:
             yield
-        except InterruptedRun as error:
-            _status(path, "interrupted", str(error))
-            raise InterruptedRun(
-                f"{error}; at most the trial under way is lost. Continue with the same "
-                "command."
-            ) from error
-        except RunError as error:
-            _status(path, "failed", str(error))
+        except BaseException as error:
+            stopped = isinstance(error, InterruptedRun | KeyboardInterrupt)
+            with contextlib.suppress(StorageError):  # the first error says more
+                state = status.INTERRUPTED if stopped else status.FAILED
+                writer.end(state, errors.reason(error))
             raise
-        _status(path, "complete")
+        writer.end(status.COMPLETE)
 
 
 def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
     """Writes config and environment of a new run, compares those of an old one."""
-    if not (path / rundir.CONFIG).exists():
-        rundir.write_json(path / rundir.CONFIG, config)
-    elif lines := differences(rundir.read_json(path / rundir.CONFIG), config):
-        another = "--name" if config["phase"] == "explore" else "--tag"
-        raise CheckpointError(
-            f"{path} was started with other numbers: {'; '.join(lines)}. Use the same "
-            f"flags, or another {another}."
-        )
-    if not (path / rundir.ENVIRONMENT).exists():
-        rundir.write_json(path / rundir.ENVIRONMENT, environment())
-        return
-    old = rundir.read_json(path / rundir.ENVIRONMENT)
-    for line in compare_environment(old, environment()):
+    identity.settle(path, config, differences)
+    for line in remember(path / rundir.ENVIRONMENT, environment()):
         distributed.say(f"warning: {line}")
-
-
-def _status(path: Path, state: str, reason: str = "") -> None:
-    status = {"state": state, "reason": reason, "time": rundir.now()}
-    rundir.write_json(path / rundir.STATUS, status)
 
 
 def _shared(state: Any, template: Any) -> Any:

@@ -6,23 +6,28 @@ A row is a trial of a seed, and of a task where one is sought:
                              explored_trials, the trials behind their model
     value                    predicted reward per imagined step
     turns                    net turns of the torso, nose down
+    bad_plans                steps whose every candidate was imagined to be not finite;
+                             left out where there is none
     returns                  of the trial under every task; return is that of its own
     fit                      of the model after the trial, where there was one
     seconds                  act and fit
 
-Null is a number that is not finite. The log is JSON Lines. A checkpoint remembers its
-size when it was written; a resumed run cuts it back to there, so that each trial is in
-it once.
+Null is a number that is not finite. The log is JSON Lines. A run that is resumed cuts
+it back to the trials that its checkpoint knows of, so that each trial is in it once.
 """
 
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.errors import CheckpointError, UsageError, storage_errors
-from experiments.storage import rundir
+import msgspec
+
+from experiments.errors import storage_errors
+from experiments.parallel import distributed
+from experiments.storage import disk, rundir
 
 # Names in rows of older versions.
 _RENAMED = {"loss": "nll"}
@@ -66,37 +71,63 @@ def number(value: Any) -> float:
     return float("nan") if value is None else float(value)
 
 
+class _Line(msgspec.Struct, kw_only=True, tag_field="phase"):
+    """What a row must have, and of what kind it is; older versions wrote less."""
+
+    arm: rundir.Name
+    seed: int
+    trial: int
+    value: float | None = None
+    turns: float | None = None
+    returns: dict[str, float | None] | None = None
+    fit: dict[str, float | None] | None = None
+    seconds: dict[str, float | None] | None = None
+
+
+class _Explore(_Line, tag="explore"):
+    pass
+
+
+class _ZeroShot(_Line, tag="zero-shot"):
+    task: str
+    explored_trials: int
+    own: float | None = msgspec.field(name="return")
+
+
+class _Finetune(_ZeroShot, tag="finetune"):
+    pass
+
+
 def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
     """Yields the rows of a log of a run with this config, in JSON.
 
     A last line without its end is left out: a run is writing it, or was killed while it
-    did.
-
-    Raises:
-      UsageError: for a line that is no row.
+    did. So is a line that is no row, and that is said.
     """
-    for i, line in enumerate(log.read_text().splitlines(keepends=True), 1):
-        if not line.endswith("\n"):
-            return
-        try:
-            yield _parsed(json.loads(line), config, log.parent)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UsageError(f"{log}:{i} is no row of a run ({error!r}).") from error
+    with log.open("rb") as file:
+        for i, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                return
+            try:
+                yield _parsed(json.loads(line), config, log.parent)
+            except (ValueError, RecursionError) as error:
+                why = f"{log}:{i} is no row of a run ({error})"
+                distributed.say(f"warning: {why}; left out.")
 
 
-def _parsed(data: dict[str, Any], config: Mapping[str, Any], run: Path) -> Row:
-    exploring = data["phase"] == "explore"
+def _parsed(data: Any, config: Mapping[str, Any], run: Path) -> Row:
+    line = msgspec.convert(data, _Explore | _ZeroShot | _Finetune)
     if fit := data.get("fit"):
         fit = {_RENAMED.get(name, name): value for name, value in fit.items()}
         data = data | {"fit": fit}
     return Row(
         preset=config["preset"],
-        arm=arm_label(data["arm"], config),
+        arm=arm_label(line.arm, config),
         phase=data["phase"],
-        seed=int(data["seed"]),
-        task="" if exploring else data["task"],
-        trial=int(data["trial"]),
-        explored=0 if exploring else int(data["explored_trials"]),
+        seed=line.seed,
+        task="" if isinstance(line, _Explore) else line.task,
+        trial=line.trial,
+        explored=0 if isinstance(line, _Explore) else line.explored_trials,
         tag=config.get("tag") or "",
         data=data,
         run=run,
@@ -109,54 +140,108 @@ def append_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     Args:
       path: The log.
       rows: Numbers may be Python's, NumPy's or jax's; NaN and infinity become null.
-    """
-    lines = [json.dumps(rundir.plain(row), allow_nan=False) + "\n" for row in rows]
-    with storage_errors(f"write {path}"), path.open("ab", buffering=0) as file:
-        start = file.seek(0, os.SEEK_END)
-        try:
-            _write_all(file.fileno(), "".join(lines).encode())
-            os.fsync(file.fileno())
-        except OSError:
-            file.truncate(start)  # Half a row would spoil the next one.
-            raise
-
-
-def _write_all(file: int, data: bytes) -> None:
-    while data:
-        data = data[os.write(file, data) :]
-
-
-def log_size(path: Path) -> int:
-    """Returns the bytes in a log, for the meta of a checkpoint; 0 if there is none."""
-    return path.stat().st_size if path.exists() else 0
-
-
-def cut_log(path: Path, offset: int) -> None:
-    """Cuts a log back to what a checkpoint knows of.
-
-    The rest goes to `<path>.orphan`, after what is there.
-
-    Args:
-      path: The log; need not exist if `offset` is 0.
-      offset: `log_size` when the checkpoint was written.
 
     Raises:
-      CheckpointError: The log is shorter than that.
+      StorageError: if the disk refuses, or the log is a link.
     """
-    size = log_size(path)
-    if size < offset:
-        raise CheckpointError(
-            f"{path} has {size} bytes, but its checkpoint knows of {offset}. Restore "
-            "the file or start over in another run directory."
-        )
-    if size == offset:
+    _append(path, _lines(rows))
+
+
+def replace_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes a log at once, as `append_rows` does; a reader sees all rows or none."""
+    disk.write(path, _lines(rows))
+
+
+def rows_by_trial(path: Path) -> Counter[int]:
+    """Returns how many rows of every trial can be read in a log that need not exist."""
+    return Counter(trial for _, trial in _trials(path) if trial is not None)
+
+
+def resume(path: Path, first: int, last: int, num_rows: int | None) -> list[str]:
+    """Cuts a log back to a checkpoint; returns what is to be said of it, as lines.
+
+    Args:
+      path: The log; what it has lost costs rows, and never the run.
+      first: The trial before those of the run.
+      last: The trial of the checkpoint; `first` if there is none.
+      num_rows: Of every trial; None if the checkpoint does not say.
+    """
+    before = rows_by_trial(path)
+    cut_log(path, last)
+    found = rows_by_trial(path)
+    num_rows = num_rows or max(found.values(), default=1)
+    lost = [trial for trial in range(first + 1, last + 1) if found[trial] < num_rows]
+    if lost:
+        return [
+            f"{path} has lost rows of {_listed(lost)}; the run goes on from checkpoint "
+            f"{last} without them."
+        ]
+    if before and last == first:
+        return [
+            f"there is a log of {_listed(sorted(before))}, but no checkpoint; the run "
+            f"starts again at trial {first + 1}, and these rows are in "
+            f"{_orphans(path)} now."
+        ]
+    return []
+
+
+def _listed(trials: Sequence[int]) -> str:
+    """Returns `trials 1 to 3, 5`."""
+    runs: list[list[int]] = []
+    for trial in trials:
+        if runs and trial == runs[-1][-1] + 1:
+            runs[-1][1:] = [trial]
+        else:
+            runs.append([trial])
+    text = ", ".join(" to ".join(map(str, run)) for run in runs)
+    return f"trial{'s' * (len(trials) > 1)} {text}"
+
+
+def cut_log(path: Path, last: int) -> None:
+    """Cuts a log back to the trials up to `last`.
+
+    The rest, and lines that are no rows, go to `<path>.orphan`, after what is there.
+    """
+    kept, rest = [], []
+    for line, trial in _trials(path):
+        (rest if trial is None or trial > last else kept).append(line)
+    if rest:
+        _append(_orphans(path), b"".join(rest).removesuffix(b"\n") + b"\n")
+        disk.write(path, b"".join(kept))
+
+
+def _orphans(path: Path) -> Path:
+    return path.with_name(rundir.ORPHANS)
+
+
+def _lines(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    lines = [json.dumps(rundir.plain(row), allow_nan=False) + "\n" for row in rows]
+    return "".join(lines).encode()
+
+
+def _trials(path: Path) -> Iterator[tuple[bytes, int | None]]:
+    """Yields the lines of a log, each with its trial; None is no row, or half a one."""
+    if not path.exists():
         return
-    with storage_errors(f"cut {path}"), path.open("rb+") as file:
-        file.seek(offset)
-        rest = file.read()
-        with path.with_name(path.name + ".orphan").open("ab") as orphans:
-            orphans.write(rest if rest.endswith(b"\n") else rest + b"\n")
-            orphans.flush()
-            os.fsync(orphans.fileno())
-        file.truncate(offset)
-        os.fsync(file.fileno())
+    with path.open("rb") as file:
+        for line in file:
+            try:
+                trial = json.loads(line)["trial"] if line.endswith(b"\n") else None
+            except (ValueError, KeyError, TypeError, RecursionError):
+                trial = None
+            yield line, trial if type(trial) is int else None
+
+
+def _append(path: Path, data: bytes) -> None:
+    with disk.opened(path, os.O_RDWR | os.O_APPEND) as file:
+        start = os.lseek(file, 0, os.SEEK_END)
+        with storage_errors(f"write {path}"):
+            try:
+                while data:
+                    data = data[os.write(file, data) :]
+                os.fsync(file)
+                if not start:
+                    disk.sync(path.parent)
+            except OSError:
+                os.ftruncate(file, start)  # Half a row would spoil the next one.
+                raise

@@ -6,14 +6,15 @@ import fcntl
 import json
 import math
 import os
-import re
 import socket
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
+import msgspec
 import numpy as np
 
 from experiments.errors import (
@@ -22,16 +23,20 @@ from experiments.errors import (
     UsageError,
     storage_errors,
 )
-from experiments.storage.disk import free_bytes, megabytes, sync
+from experiments.storage import disk
+from experiments.storage.disk import free_bytes, megabytes
 
 CONFIG = "config.json"
 ENVIRONMENT = "env.json"
 STATUS = "status.json"
+IDENTITY = "run.json"
 METRICS = "metrics.jsonl"
+ORPHANS = f"{METRICS}.orphan"
 CHECKPOINTS = "checkpoints"
 TRAJECTORIES = "trajectories.npz"
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+# What can only be one file or folder below another.
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 _MAX_JSON_BYTES = 1_000_000
 
 
@@ -42,12 +47,14 @@ def now() -> str:
 
 def check_name(name: str) -> None:
     """Raises UsageError unless `name` can only be one folder below the output."""
-    if not _NAME.fullmatch(name):
+    try:
+        msgspec.convert(name, Name)
+    except msgspec.ValidationError:
         shown = name if len(name) <= 64 else name[:61] + "..."
         raise UsageError(
             f"run {shown!r} is not a valid name (use letters, digits, '.', '_', '-', "
             "at most 64, starting with a letter or digit)."
-        )
+        ) from None
 
 
 @contextlib.contextmanager
@@ -56,31 +63,28 @@ def lock(run_dir: Path) -> Iterator[None]:
 
     Raises:
       CheckpointError: Another process holds it; the message says which.
-      StorageError: The directory cannot be made or locked.
+      StorageError: The directory cannot be made or locked, or is a link.
     """
-    path = run_dir / ".lock"
-    with storage_errors(f"lock {run_dir}"):
-        run_dir.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-    try:
-        with storage_errors(f"lock {run_dir}"):
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise CheckpointError(
-                    f"{run_dir} is in use by {_holder(file)}. Stop it or choose "
-                    "another run directory."
-                ) from None
-            owner = {
-                "pid": os.getpid(),
-                "host": socket.gethostname(),
-                "start": time.strftime("%Y-%m-%d %H:%M:%S"),
-            }
-            os.ftruncate(file, 0)
-            os.pwrite(file, json.dumps(owner).encode(), 0)
+    disk.check_own(run_dir, folder=True)
+    with storage_errors(f"make {run_dir}"):
+        disk.make(run_dir)
+    # Never unlinked: a waiting process may have it open already.
+    with disk.opened(run_dir / ".lock", os.O_RDWR) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CheckpointError(
+                f"{run_dir} is in use by {_holder(file)}. Stop it or choose another "
+                "run directory."
+            ) from None
+        owner = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "start": time.strftime("%Y-%m-%d %H:%M:%S"),
+        }
+        os.ftruncate(file, 0)
+        os.pwrite(file, json.dumps(owner).encode(), 0)
         yield
-    finally:
-        os.close(file)  # Never unlinked: a waiting process may have it open already.
 
 
 def _holder(file: int) -> str:
@@ -96,18 +100,19 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
     """Makes a run directory, and writes and reads there before anything is compiled.
 
     Raises:
-      StorageError: It cannot be written, or has less than `needed_bytes` free.
+      StorageError: It cannot be written, a link leads out of it, or it has less than
+        `needed_bytes` free.
     """
-    path = run_dir / f".probe-{os.getpid()}"
     data = os.urandom(4096)
     with storage_errors(f"write in {run_dir}"):
-        run_dir.mkdir(parents=True, exist_ok=True)
-        try:
-            path.write_bytes(data)
-            sync(path)
-            same = path.read_bytes() == data
-        finally:
-            path.unlink(missing_ok=True)
+        disk.make(run_dir)
+        disk.check_own(run_dir / CHECKPOINTS, folder=True)
+        for name in (METRICS, ORPHANS):
+            disk.check_own(run_dir / name)
+        with disk.draft(run_dir / ".probe") as probe:
+            probe.write_bytes(data)
+            disk.sync(probe)
+            same = probe.read_bytes() == data
     if not same:
         raise StorageError(f"{run_dir} does not read back what is written. Check it.")
     if (free := free_bytes(run_dir)) < needed_bytes:
@@ -120,39 +125,28 @@ def probe(run_dir: Path, needed_bytes: int) -> None:
 def write_json(path: Path, data: Any) -> None:
     """Replaces a JSON file at once; a reader sees the old file or the new one."""
     text = json.dumps(plain(data), indent=2, allow_nan=False) + "\n"
-    replace_file(path, text.encode())
+    disk.write(path, text.encode())
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Replaces a file at once, and on the disk; a failure leaves the old one."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with storage_errors(f"write {path}"):
-        try:
-            draft.write_bytes(data)
-            sync(draft)
-            draft.replace(path)
-        finally:
-            draft.unlink(missing_ok=True)
-        sync(path.parent)
-
-
-def read_json(path: Path) -> Any:
-    """Reads a JSON file of a run.
+def read_json(path: Path, limit: int = _MAX_JSON_BYTES) -> Any:
+    """Reads a JSON file of a run of at most `limit` bytes.
 
     Raises:
       CheckpointError: It is missing, too large or not JSON; the message says where.
     """
     if not path.is_file():
-        raise CheckpointError(f"{path} does not exist or is not a file.")
+        raise CheckpointError(f"{path} does not exist or is not a file. Restore it.")
     try:
         with path.open("rb") as file:
-            data = file.read(_MAX_JSON_BYTES + 1)
-        if len(data) > _MAX_JSON_BYTES:
+            data = file.read(limit + 1)
+        if len(data) > limit:
             raise CheckpointError(
-                f"{path} is larger than {megabytes(_MAX_JSON_BYTES)}. It is not a file "
-                "of a run."
+                f"{path} is larger than {megabytes(limit)}. It is not a file of a run."
             )
-        return json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+        text = data.decode("utf-8")
+        return json.loads(
+            text, parse_constant=_refuse_constant, object_pairs_hook=_object
+        )
     except json.JSONDecodeError as error:
         why = f"{error.msg}, line {error.lineno}, column {error.colno}"
     except (UnicodeDecodeError, ValueError, RecursionError, OSError) as error:
@@ -163,14 +157,21 @@ def read_json(path: Path) -> Any:
 def find_json(path: Path) -> dict[str, Any]:
     """Returns the object in a file, or an empty one if there is none to read."""
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
+        found = read_json(path, 100 * _MAX_JSON_BYTES)
+    except CheckpointError:
         return {}
     return found if isinstance(found, dict) else {}
 
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    (name, count), *_ = Counter(name for name, _ in pairs).most_common(1) or [("", 1)]
+    if count > 1:
+        raise ValueError(f"{name!r} is there twice")
+    return dict(pairs)
 
 
 def plain(value: Any) -> Any:

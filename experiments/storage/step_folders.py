@@ -5,7 +5,8 @@ old name or the new one. Other names are left alone but for these:
 
     7.orbax-checkpoint-tmp  a save that has not finished; removed by the next one
     .deleted                old steps on their way out; removed by the next save
-    .corrupt-7              a step that failed its checks; kept for the user
+    .damaged-7, .foreign-7  a step that failed its checks, or is another run's; kept
+                            for the user
 
 The seal is the SHA-256 of every file, as `sha256sum -c` reads it: nothing parses a file
 of a checkpoint before its bytes are known to be those that were written.
@@ -41,9 +42,9 @@ def steps(directory: Path) -> list[int]:
     ]
 
 
-def quarantine(directory: Path, number: int) -> str:
-    """Sets a damaged step aside and returns what became of it, for the warning."""
-    target = directory / f".corrupt-{number}"
+def quarantine(directory: Path, number: int, kind: str) -> str:
+    """Sets a step aside and returns what became of it, for the warning."""
+    target = directory / f".{kind}-{number}"
     if os.path.lexists(target):
         target = target.with_name(f"{target.name}.{time.time_ns()}")
     try:
@@ -56,6 +57,8 @@ def quarantine(directory: Path, number: int) -> str:
 def sweep(directory: Path) -> None:
     """Removes what did not finish; what cannot be removed waits for the next time."""
     for path in itertools.chain(*map(directory.glob, _UNFINISHED)):
+        if path.is_symlink():  # orbax would put old steps where it leads
+            path.unlink(missing_ok=True)
         shutil.rmtree(path, ignore_errors=True)
 
 
@@ -77,6 +80,8 @@ def broken(folder: Path) -> str | None:
     sealed = {
         name: checksum for checksum, _, name in (x.partition("  ") for x in lines)
     }
+    if not sealed:
+        return f"{SEAL} is empty"
     for name in sorted(sealed.keys() | found):
         if name not in found or name not in sealed:
             return (

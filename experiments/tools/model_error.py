@@ -16,7 +16,7 @@ Targets are those of PETS: the velocity itself, changes of all else.
 import argparse
 import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +26,8 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from experiments import phases
-from experiments.build import build
+from experiments import exploration
+from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
@@ -67,7 +67,10 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     """
     if num_rows < 1:
         raise UsageError(f"--rows {num_rows} is not valid; it must be 1 or more.")
-    configs = [from_json(RunFolder(run).config(), PRESETS["smoke"]) for run in runs]
+    configs = [
+        from_json(RunFolder(run).config(), PRESETS["smoke"], str(run / rundir.CONFIG))
+        for run in runs
+    ]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
     # The random trials of a seed are the same in all arms: all models know them.
@@ -119,8 +122,12 @@ def _read(
 ) -> Explored:
     """Restores the models of a run and draws transitions from row `first` on."""
     parts = build(config)
-    whole = phases.explored_template(config, parts)
-    template = phases.model_of(whole)._replace(dataset=whole.dataset)
+    saved = exploration.as_saved(config, parts)
+
+    def template(leaves: Mapping[str, Any]) -> State:
+        whole = saved(leaves)
+        return exploration.model_of(whole)._replace(dataset=whole.dataset)
+
     folder = RunFolder(run)
     if at_trial is None:
         found = folder.restore(template, part=True)

@@ -9,20 +9,19 @@ run's own back.
 
 import argparse
 import dataclasses
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 
-from experiments import cli, phases
-from experiments.build import build
+from experiments import cli, exploration
+from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import from_json, to_json
 from experiments.errors import RunError, UsageError
 from experiments.presets import PRESETS, PRETRAINED_PLANNER
-from experiments.storage import metrics, rundir
+from experiments.storage import disk, metrics, rundir
 from experiments.storage.folder import RunFolder
 
 
@@ -43,7 +42,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
     plain = RunFolder(run).config()
-    config = from_json(plain, PRESETS["smoke"])
+    config = from_json(plain, PRESETS["smoke"], str(run / rundir.CONFIG))
     seed = config.seeds[0] if seed is None else seed
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
@@ -62,15 +61,17 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     model = RunFolder(folder)
     model.save(step, state)
     model.write_json(rundir.CONFIG, to_json(shipped))
-    shutil.copyfile(run / rundir.ENVIRONMENT, folder / rundir.ENVIRONMENT)
+    origins = {rundir.ENVIRONMENT: run / rundir.ENVIRONMENT}
     for file in (rundir.CONFIG, rundir.ENVIRONMENT):  # how it came to be what it is
-        shutil.copyfile(evaluated.path / file, folder / f"performed-{file}")
+        origins[f"performed-{file}"] = evaluated.path / file
+    for file, origin in origins.items():
+        disk.write(folder / file, origin.read_bytes())
     rows = metrics.read(run / rundir.METRICS, plain)
     model.log([row.data for row in rows if row.seed == seed])
     return folder
 
 
-def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, phases.State]:
+def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, State]:
     """Returns the folder of the last zero-shot, its trial, and the model `[S]` of it.
 
     That of all tasks and without a tag, if there is one.
@@ -80,7 +81,7 @@ def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, phases.State]
     if not evaluated:
         raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
     last = max(evaluated, key=_rank)
-    template = phases.model_of(phases.explored_template(config, build(config)))
+    template = exploration.model_of(exploration.template(config, build(config)))
     found = last.restore(template)
     assert found is not None
     return last, *found

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.errors import RunError, UsageError
+from experiments.storage import disk
 
 _NO_GL = 69  # exit code of the child where OpenGL does not work; EX_UNAVAILABLE
 _BACKENDS = ("egl", "osmesa")
@@ -153,24 +154,20 @@ def open_renderer(look: Look) -> Draw:
 
 
 def write_mp4(target: Path, pictures: Iterator[np.ndarray], look: Look) -> None:
-    """Writes pictures as H.264; target appears only when it is complete."""
+    """Writes pictures as H.264."""
     import imageio_ffmpeg
 
-    partial = target.with_name(f".{target.stem}.partial.mp4")
     size = (look.width, look.height)
     # yuv420p wants even sizes, no more.
     writer = imageio_ffmpeg.write_frames(
-        str(partial), size, fps=look.fps, macro_block_size=2, ffmpeg_log_level="error"
+        str(target), size, fps=look.fps, macro_block_size=2, ffmpeg_log_level="error"
     )
     writer.send(None)
     try:
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture))
-        writer.close()
-        os.replace(partial, target)
     finally:
         writer.close()
-        partial.unlink(missing_ok=True)
 
 
 def write_gif(target: Path, cut: list[np.ndarray], *, fps: float) -> None:
@@ -256,9 +253,11 @@ def _render_here(args: argparse.Namespace) -> None:
             yield picture
 
     args.target.parent.mkdir(parents=True, exist_ok=True)
-    write_mp4(args.target, pictures(), look)
+    with disk.replaced(args.target) as draft:
+        write_mp4(draft, pictures(), look)
     if cut:
-        write_gif(args.target.with_suffix(".gif"), cut, fps=args.fps / _GIF_SKIP)
+        with disk.replaced(args.target.with_suffix(".gif")) as draft:
+            write_gif(draft, cut, fps=args.fps / _GIF_SKIP)
 
 
 def _positions(obs: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import toys
 
 import jaxpets
 from benchmarks import accuracy, workloads
-from experiments import phases
+from experiments import exploration
 from experiments.build import build
 from experiments.entries import to_json
 from experiments.presets import PRESETS
@@ -73,7 +73,7 @@ def performed(tmp_path_factory):
     keys = jax.random.split(jax.random.key(0), 2)
     size = dataclasses.replace(SIZE, hidden_sizes=(16, 16))
     params = jax.jit(jax.vmap(functools.partial(workloads.params, size)))(keys)
-    model = phases.model_of(phases.explored_template(config, build(config)))
+    model = exploration.model_of(exploration.template(config, build(config)))
     model = model._replace(params=params)
     checkpoint.save(folder / "checkpoints", 60, model, {}, finite=model)
     obs = np.random.default_rng(0).normal(size=(2, 4, 2, 50, half_cheetah.OBS_SIZE))

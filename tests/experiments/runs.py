@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from experiments import cli, phases
+from experiments import cli, exploration
 from experiments.build import build
 from experiments.run import main
 from experiments.storage import checkpoint
@@ -71,7 +71,7 @@ def numbers(row):
 def learner(folder, step=None):
     """Restores the learner of an exploration run, by default the newest."""
     config = cli.parse(["--phase", "zero-shot", "--from", str(folder)])
-    template = phases.explored_template(config, build(config))
+    template = exploration.as_saved(config, build(config))
     found = checkpoint.restore(
         folder / "checkpoints", template, step=step, warn=pytest.fail
     )

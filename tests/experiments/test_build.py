@@ -20,6 +20,23 @@ def value(*flags):
     return step(jaxpets.PlanParams(params, weights))[0].value
 
 
+@pytest.mark.parametrize(
+    ("rollout", "flags", "wanted"),
+    [
+        (("", "g++ 12.2"), (), "kernel of g++ 12.2"),
+        (("no compiler", ""), (), "scan (no compiler)"),
+        (("", "g++ 12.2"), ("--task-planner.no-fused",), "scan"),
+    ],
+    ids=["kernel", "fallback", "scan"],
+)
+def test_what_plans_is_named(monkeypatch, rollout, flags, wanted):
+    fused = jaxpets.typing.FusedRollout(lambda params: None, *rollout)
+    monkeypatch.setattr(jaxpets, "fused_rollout", lambda *_, **__: fused)
+    phase = ["--phase", "explore", "--preset", "smoke", "--arm", "random"]
+    parts = build(cli.parse([*phase, *flags]))
+    assert (parts.explored_by, parts.performed_by) == ("none", wanted)
+
+
 def test_pessimism_lowers_what_a_plan_is_worth():
     plain, doubtful = value(), value("--pessimism", "2")
     assert doubtful < plain

@@ -18,7 +18,7 @@ from states import as_bytes, make_state, restore, save_two
 
 from experiments.errors import CheckpointError, StorageError
 from experiments.storage import checkpoint, disk
-from experiments.storage.step_folders import seal
+from experiments.storage.step_folders import SEAL, seal
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,7 +39,7 @@ def assert_falls_back(directory: Path, because: str = "") -> None:
     assert because in warnings[0]
     assert "\n" not in warnings[0]
     assert checkpoint.steps(directory) == [1]
-    assert (directory / ".corrupt-2").exists()
+    assert (directory / ".damaged-2").exists()
 
 
 # Damage.
@@ -110,6 +110,9 @@ def test_husks_of_every_kind(directory, tmp_path):
         shutil.rmtree(step)
         step.mkdir()
 
+    def empty_seal(step: Path) -> None:
+        (step / SEAL).write_text("")
+
     def half(step: Path) -> None:
         for path in files_of(step)[::2]:
             path.unlink()
@@ -143,11 +146,39 @@ def test_husks_of_every_kind(directory, tmp_path):
         shutil.copytree(step.with_name("1"), step)
 
     links = [link, link_inside, linked_folder]
-    for kind in [empty, half, file, pipe, stranger, renamed, *links]:
+    why = {empty_seal: "SHA256SUMS is empty", stranger: "state/more does not belong"}
+    for kind in [empty, empty_seal, half, file, pipe, stranger, renamed, *links]:
         copy = tmp_path / kind.__name__ / "checkpoints"
         shutil.copytree(directory, copy)
         kind(copy / "2")
-        assert_falls_back(copy)
+        assert_falls_back(copy, why.get(kind, ""))
+
+
+def test_what_did_not_finish_is_swept_and_no_link_followed(directory, tmp_path):
+    """Orbax moves old steps to `.deleted`."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (directory / ".deleted").symlink_to(outside)
+    (directory / "3.orbax-checkpoint-tmp").symlink_to(outside)
+    checkpoint.save(directory, 3, make_state(3), {})
+    assert sorted(os.listdir(directory)) == ["2", "3"]
+    assert list(outside.iterdir()) == []
+
+
+def test_a_step_of_another_run_is_not_used(directory):
+    def foreign(meta: dict) -> str | None:
+        return "of run 'b', not 'a'" if meta["log"] == 2 else None
+
+    found, warnings = restore(directory, foreign=foreign)
+    assert found is not None and found[0] == 1
+    assert warnings == [
+        "checkpoint 2 is foreign (of run 'b', not 'a'); moved to .foreign-2, using 1."
+    ]
+    words = r"no checkpoint in .* can be used \(1 is foreign: mine\)"
+    with pytest.raises(CheckpointError, match=words):
+        restore(directory, foreign=lambda meta: "mine")
+    with pytest.raises(CheckpointError, match=r"1 in .* is foreign \(mine\)\. Choose"):
+        restore(directory, step=1, foreign=lambda meta: "mine")
 
 
 def test_every_step_damaged_moves_nothing(directory):
@@ -155,8 +186,8 @@ def test_every_step_damaged_moves_nothing(directory):
         (directory / step / "meta" / "metadata").write_text("{}")
     with pytest.raises(CheckpointError) as error:
         restore(directory)
-    assert "all 2 checkpoints" in str(error.value)
-    assert "2: checksum of meta/metadata; 1: checksum of" in str(error.value)
+    words = "2 is damaged: checksum of meta/metadata; 1 is damaged: checksum of"
+    assert f"no checkpoint in {directory} can be used ({words}" in str(error.value)
     assert sorted(os.listdir(directory)) == ["1", "2"]
 
 

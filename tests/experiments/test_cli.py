@@ -2,15 +2,17 @@
 
 import dataclasses
 import json
+import warnings
 
 import pytest
 
-from experiments import cli
+from experiments import cli, phases
 from experiments.config import Config
 from experiments.entries import to_json
-from experiments.errors import OutOfMemoryError
+from experiments.errors import InterruptedRun, OutOfMemoryError
 from experiments.presets import PRESETS
 from experiments.run import _plain_errors, main
+from experiments.storage import status
 
 SMOKE = ("--phase", "explore", "--preset", "smoke")
 LATER = ("--phase", "zero-shot", "--preset", "smoke")
@@ -168,6 +170,18 @@ def test_a_run_gives_its_numbers_and_nothing_else(out, tmp_path):
     )
 
 
+def test_a_later_phase_follows_no_link_out_of_the_run(fail, out, tmp_path):
+    run, outside = explored(out).parent, tmp_path / "outside"
+    step = run / "checkpoints" / "3"
+    step.mkdir(parents=True)
+    (step / "SHA256SUMS").touch()
+    outside.mkdir()
+    (run / "zero-shot-003").symlink_to(outside)
+    code, line = fail(*LATER)
+    assert code == 5 and f"{run / 'zero-shot-003'} is a link, or no folder" in line
+    assert list(outside.iterdir()) == []
+
+
 def test_from_names_a_run_anywhere(out):
     path = explored(out, name="mine", arm="count", num_bits=16)
     config = cli.parse(["--phase", "finetune", "--from", str(path.parent)])
@@ -287,3 +301,48 @@ def test_best_is_the_paper_with_another_refit_and_search_for_tasks():
     assert cli.parse(flags).task_planner.horizon == 20
     laptop = cli.parse(["--phase", "explore", "--arm", "best"])
     assert laptop.task_planner == PRESETS["laptop"].task_planner
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (MemoryError(), 6, "error: out of memory. 1 seeds x"),
+        (RuntimeError("RESOURCE_EXHAUSTED: 9 TB"), 6, "error: out of memory. 1 seeds"),
+        (OSError(28, "No space left on device"), 5, "error: cannot go on (No space"),
+        (OSError(30, "Read-only", "/x"), 5, "error: cannot use /x (Read-only). Check"),
+        (InterruptedRun("SIGTERM"), 75, "stopped: SIGTERM; at most the trial under"),
+    ],
+)
+def test_what_ends_a_run_is_a_line_and_its_status(
+    out, capsys, monkeypatch, error, code, said
+):
+    def explore(config, run):
+        raise error
+
+    monkeypatch.setattr(phases, "explore", explore)
+    assert main([*SMOKE, "--out", str(out)]) == code
+    err = capsys.readouterr().err
+    assert err.startswith(said) and err.count("\n") == 1
+    found = status.read(out / "smoke-epistemic")
+    assert found.state == ("interrupted" if code == 75 else "failed")
+    assert err.partition(": ")[2].startswith(found.reason)
+
+
+def test_a_command_that_has_no_run_yet_is_stopped_in_a_line(out, capsys, monkeypatch):
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "parse", interrupted)
+    assert main([*SMOKE, "--out", str(out)]) == 75
+    assert capsys.readouterr().err.startswith("stopped: SIGINT; ")
+
+
+def test_a_warning_is_one_line_without_its_source(out, capsys, monkeypatch):
+    def explore(config, run):
+        warnings.warn("the kernel was built anew", stacklevel=1)
+
+    monkeypatch.setattr(phases, "explore", explore)
+    assert main([*SMOKE, "--out", str(out)]) == 0
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "warning: the kernel was built anew"
+    assert second.startswith("next: ")

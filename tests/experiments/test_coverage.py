@@ -158,9 +158,9 @@ def test_a_complete_run_gets_what_is_missing_and_keeps_what_is_there(again, caps
     path.unlink()
     assert go_on(again) == 0
     assert path.read_bytes() == written
-    path.write_text("mine")
+    path.write_text('{"mine": 1}')
     assert go_on(again) == 0
-    assert path.read_text() == "mine"
+    assert path.read_text() == '{"mine": 1}'
     errors = capsys.readouterr().err
     assert errors.count("already complete: 3 of 3 trials") == 2
 

@@ -83,6 +83,25 @@ def test_no_entry_takes_just_anything(name):
         from_json(file_with(name, {"x": 1}), Config())
 
 
+@pytest.mark.parametrize("value", ["../../x", "/etc/x", "a\x1b[2J\n", "a\0b"])
+def test_what_a_stranger_may_write_is_a_name_or_a_path_or_refused(value):
+    """Names and paths are never taken from the folder of a run: see test_cli.py."""
+    taken = set()
+    for entry in entries(Config):
+        try:
+            from_json(file_with(entry.name, value), Config())
+        except CheckpointError as error:
+            assert entry.name in str(error) and str(error).isprintable()
+        else:
+            taken.add(entry.name)
+    assert taken == {"out", "name", "tag", "video", "source", "coordinator_address"}
+    with pytest.raises(CheckpointError) as error:
+        from_json({value: 1}, Config(), "runs/x/config.json")
+    words = "Use the version that wrote it."
+    assert str(error.value).startswith("runs/x/config.json has an unknown entry '")
+    assert str(error.value).isprintable() and str(error.value).endswith(words)
+
+
 @pytest.mark.skipif(not RESULTS.exists(), reason="not in this copy of the code")
 def test_all_configs_that_were_ever_committed_can_be_read():
     paths = sorted(RESULTS.rglob("*config.json"))
@@ -100,6 +119,7 @@ def test_differences_name_the_field():
     new = json.loads(json.dumps(old))
     assert differences(old, new) == []
     new["planner"]["horizon"], new["seeds"], new["debug"] = 5, [1], True
+    new["num_trials"] = 99  # how long it goes on is not which run it is
     assert differences(old, new) == [
         "planner.horizon: 3 (there) vs 5 (now)",
         "seeds: [0] (there) vs [1] (now)",

@@ -12,7 +12,11 @@ import pytest
 
 from experiments.errors import CheckpointError
 from experiments.storage import rundir
-from experiments.storage.environment import compare_environment, environment
+from experiments.storage.environment import (
+    compare_environment,
+    environment,
+    remember,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -28,6 +32,7 @@ def test_environment_is_json_and_complete(tmp_path):
     assert now["x64"] is jax.config.jax_enable_x64  # pyright: ignore
     assert now["prng_impl"] == "threefry2x32"
     names = {"jaxpets", "python", "jaxlib", "flax", "optax", "orbax-checkpoint", "git"}
+    assert now["processor"]
     flags = {"threefry_partitionable", "matmul_precision", "xla_flags", "device_kind"}
     assert names | flags | {"mujoco", "mujoco-mjx"} <= now.keys()
 
@@ -45,6 +50,19 @@ def test_differences_between_environments():
     for changed in ({"x64": not now["x64"]}, {"prng_impl": "rbg"}):
         with pytest.raises(CheckpointError, match=f"{next(iter(changed))} was"):
             compare_environment({**now, **changed}, now)
+
+
+def test_the_environment_of_the_start_is_kept(tmp_path):
+    path = tmp_path / "env.json"
+    assert remember(path, {"jax": "1"}) == []
+    assert remember(path, {"rollout": "kernel of g++ 12"}) == []
+    lines = remember(path, {"rollout": "scan (no compiler)"})
+    assert lines == ["rollout was kernel of g++ 12 and is now scan (no compiler)"]
+    began = {"jax": "1", "rollout": "kernel of g++ 12"}
+    assert rundir.read_json(path) == began
+    path.write_text("[]")
+    with pytest.raises(CheckpointError, match=r"env\.json is not an object"):
+        remember(path, {"jax": "1"})
 
 
 def test_flags_of_another_process_are_seen():

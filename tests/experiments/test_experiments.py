@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import time
 
 import jax
 import numpy as np
@@ -135,6 +136,23 @@ def test_interrupted_and_resumed_equals_uninterrupted(straight, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_refit_that_would_take_minutes_stops_in_time(again):
+    refit = ("--refit.num-epochs", "10000", "--refit.batch-size", "1")
+    process = start("--phase", "zero-shot", "--from", again, *refit)
+    path = again / "zero-shot-003" / "status.json"
+    while not path.exists() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(2)  # it compiles, or runs
+    process.send_signal(signal.SIGHUP)
+    begin = time.monotonic()
+    code, errors = finish(process)
+    assert code == 75, errors
+    assert time.monotonic() - begin < 8.0  # five, and what a busy machine adds
+    assert errors.startswith("stopped: SIGHUP; ") and errors.count("\n") == 1
+    assert status(path.parent) == "interrupted"
+
+
+@pytest.mark.slow
 def test_a_damaged_checkpoint_costs_one_trial(straight, again):
     data = max(
         (again / "checkpoints" / str(TRIAL)).rglob("*"),
@@ -157,6 +175,29 @@ def test_a_finished_run_is_left_alone(again, capsys):
     assert main([*SMOKE, "--out", str(again.parent)]) == 0
     assert "already complete: 3 of 3 trials" in capsys.readouterr().err
     assert contents(again) == before
+
+
+@pytest.mark.slow
+def test_a_run_may_be_given_more_trials(straight, again, capsys):
+    longer = [*SMOKE, "--out", str(again.parent), "--num-trials", "4"]
+    assert main(longer) == 0
+    assert [row["trial"] for row in rows(again)] == [1, 2, 3, 4]
+    assert untimed(again)[:3] == untimed(straight[0])
+    assert json.loads((again / "config.json").read_text())["num_trials"] == 4
+    old, new = learner(straight[0]).dataset, learner(again).dataset
+    assert int(new.size) == new.data.obs.shape[1] == 4 * STEPS
+    np.testing.assert_array_equal(new.data.obs[:, : 3 * STEPS], old.data.obs)
+
+    # The last one again, from a checkpoint that has less room; then fewer than all.
+    once = again.parent / "once"
+    shutil.copytree(again, once)
+    shutil.rmtree(again / "checkpoints" / "4")
+    assert main(longer) == 0
+    assert_same_run(again, once)
+    capsys.readouterr()
+    assert main([*longer[:-1], "2"]) == 0
+    assert "already complete: 2 of 2 trials" in capsys.readouterr().err
+    assert json.loads((again / "config.json").read_text())["num_trials"] == 4
 
 
 @pytest.mark.slow
@@ -211,11 +252,26 @@ def test_two_seeds_through_all_phases(straight, tmp_path, capsys, monkeypatch):
     _check_task(tuned, [(0, 4), (7, 4), (0, 5), (7, 5)], trials=1)
     assert all(set(row["fit"]) == FIT for row in rows(tuned))
     assert [row["fit"]["num_updates"] for row in rows(tuned)] == [5, 5, 7, 7]
+    _check_recovery(tuned, ["--phase", "finetune", *task], capsys)
 
     assert main(["--phase", "report", "--out", str(tmp_path)]) == 0
     table = json.loads((tmp_path / "report" / "table1.json").read_text())
     assert "back-flip" in json.dumps(table)
     assert capsys.readouterr().out == ""
+
+
+def _check_recovery(tuned, command, capsys):
+    """What a stop after the last checkpoint loses is made again from that."""
+    path, log = tuned / "trajectories.npz", (tuned / "metrics.jsonl").read_bytes()
+    before = dict(np.load(path))
+    os.truncate(path, path.stat().st_size - 50)
+    assert main(command) == 0
+    assert f"{path} is not whole: made again." in capsys.readouterr().err
+    after = dict(np.load(path))
+    assert after.keys() == before.keys()
+    for name, array in before.items():
+        np.testing.assert_array_equal(after[name], array)
+    assert (tuned / "metrics.jsonl").read_bytes() == log
 
 
 def _check_side_by_side(folder, alone):

@@ -20,7 +20,7 @@ from experiments import cli
 from experiments.parallel.distributed import ProcessSpec
 from experiments.report import coverage
 from experiments.run import main
-from experiments.storage import checkpoint
+from experiments.storage import checkpoint, status
 
 RUN = ("-m", "experiments.run")
 SEEDS = ("--seeds", "0", "1")
@@ -107,9 +107,12 @@ def found(tmp_path_factory):
 def test_a_signal_to_one_stops_all(found):
     assert found.codes == [75, 75], found.said
     (first,), (second,) = errors(found.said)
-    assert first.startswith("stopped: SIGTERM; ") and "same command" in first
-    assert second.startswith("stopped: SIGTERM")
-    assert (found.state["state"], found.state["reason"]) == ("interrupted", "SIGTERM")
+    # A signal that a compilation keeps from its tick for too long ends its process.
+    reasons = ("SIGTERM", "process 1 is gone")
+    reason = found.state["reason"]
+    assert found.state["state"] == "interrupted" and reason in reasons
+    assert first.startswith(f"stopped: {reason}; ") and "same command" in first
+    assert second.startswith("stopped: SIGTERM; ")
     assert found.saved == [1]
 
 
@@ -181,8 +184,16 @@ def test_a_host_that_is_gone_ends_the_other(tmp_path):
     processes[1].kill()
     (first, second), said = finish(processes)
     assert second == -signal.SIGKILL
-    assert first not in (0, 75), said
-    assert checkpoint.steps(tmp_path / "a" / runs.NAME / "checkpoints") == [1]
+    assert first == 75, said
+    assert said[0] == (
+        "stopped: process 1 is gone; at most the trial under way is lost. Continue "
+        "with the same command.\n"
+    )
+    folder = tmp_path / "a" / runs.NAME
+    assert checkpoint.steps(folder / "checkpoints") == [1]
+    found = status.read(folder)
+    assert (found.state, found.reason) == ("interrupted", "process 1 is gone")
+    assert (found.trial, found.num_trials) == (1, runs.LAST)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,17 @@
 """What is said of a trial, and what the log keeps of it."""
 
+import json
+
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from experiments.errors import UsageError
+import jaxpets
+from experiments import records
+from experiments.acting import Trials
 from experiments.records import describe
 from experiments.storage import metrics
-from jaxpets.envs.half_cheetah import TASK_NAMES
+from jaxpets.envs.half_cheetah import OBS_SIZE, TASK_NAMES
 
 
 def row(returns, **labels):
@@ -28,6 +34,17 @@ def test_a_task_counts_where_it_was_sought():
         row([-7, 7, 0, 0], task="backward"),
     ]
     assert describe(rows) == "value 2  returns:  forward 15  backward 7"
+
+
+def test_plans_without_a_finite_candidate_are_counted():
+    """Every candidate of two steps of the second trial, at a horizon of 30."""
+    values = np.ones((2, 3), np.float32)
+    values[1, :2] = jaxpets.optimizers.WORST_VALUE / 30
+    obs = jnp.zeros((2, 3, OBS_SIZE))
+    trials = Trials(jaxpets.Transition(obs, jnp.zeros((2, 3, 6)), obs), values)
+    good, bad = records.rows([{"phase": "explore"}] * 2, trials)
+    assert "bad_plans" not in good and bad["bad_plans"] == 2
+    assert describe([good, bad]).endswith("  bad plans: 2")
 
 
 def test_a_log_of_an_older_version_has_todays_names(tmp_path):
@@ -54,8 +71,34 @@ def test_a_task_has_a_return_of_its_own():
     assert row_["return"] == -3.0 and "fit" not in row_
 
 
-def test_a_line_that_is_no_row(tmp_path):
+GOOD = {"phase": "zero-shot", "arm": "best", "seed": 1, "task": "forward", "trial": 2}
+GOOD |= {"explored_trials": 3, "return": None}
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (b'{"phase": "explore"}', "missing required field `arm`"),
+        (b'{"phase": "\\u001b[2J"}', r"Invalid value '\x1b[2J' - at `$.phase`"),
+        (b'{"phase": "expl\xe1re"}', "can't decode byte 0xe1 in position 15"),
+        (b"[" * 100_000, "recursion"),
+        (b"", "Expecting value"),
+        (b"7", "Expected `object`, got `int`"),
+        *[
+            (json.dumps(GOOD | {name: value}).encode(), f"at `$.{name}")
+            for name, value in {
+                "arm": "a/../b", "seed": "1", "trial": None, "task": 3, "return": "x",
+                "fit": 3, "seconds": [], "returns": {"forward": "x"},
+                "explored_trials": 1.5,
+            }.items()
+        ],
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_row_is_left_out_and_named(tmp_path, capsys, line, why):
     log = tmp_path / "metrics.jsonl"
-    log.write_text('{"phase": "explore"}\n')
-    with pytest.raises(UsageError, match=r"metrics.jsonl:1 is no row of a run"):
-        list(metrics.read(log, {}))
+    good = json.dumps(GOOD).encode()
+    log.write_bytes(b"\n".join([good, line, good, b""]))
+    assert len(list(metrics.read(log, {"preset": "smoke"}))) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"warning: {log}:2 is no row of a run (")
+    assert why in said and said.endswith("); left out.\n") and said.count("\n") == 1

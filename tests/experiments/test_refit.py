@@ -10,7 +10,7 @@ import runs
 import toys
 
 import jaxpets
-from experiments import cli, phases
+from experiments import cli, exploration
 from experiments.build import REFIT, build, trial_keys
 from experiments.run import main
 from experiments.storage import checkpoint
@@ -38,7 +38,7 @@ def performed(explored):
 
 
 def model(folder, config):
-    template = phases.model_of(phases.explored_template(config, build(config)))
+    template = exploration.model_of(exploration.template(config, build(config)))
     found = checkpoint.restore(folder / "checkpoints", template, warn=pytest.fail)
     assert found is not None and found[0] == runs.LAST
     return found[1].params

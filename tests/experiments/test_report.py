@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from small_logs import EXPLORED, explore_rows, write_run
 
-from experiments.errors import UsageError
+from experiments.errors import CheckpointError, UsageError
+from experiments.report import logs, task_sections
 from experiments.report.report import load, write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
@@ -299,6 +300,14 @@ def test_a_setting_that_a_run_did_not_record_is_named(tmp_path):
     assert "); not recorded (laptop-random)." in text
 
 
+def test_random_trials_without_returns_are_left_out(out):
+    log = out / "laptop-count" / "metrics.jsonl"
+    edit_rows(log, lambda row: row | {"returns": None})
+    rows = [row for row in load(out) if row.arm == "count-16"]
+    lines = task_sections.zero_shot(rows, logs.scores(rows, EXPLORED), EXPLORED)
+    assert "### Every seed" in lines and not any("Random" in line for line in lines)
+
+
 def test_what_a_phase_does_not_use_may_differ_in_it(tmp_path):
     for arm, horizon in (("epistemic", 20), ("best", 30)):
         write_arm(tmp_path / "runs", arm, [1.0], task_planner={"horizon": horizon})
@@ -314,16 +323,38 @@ def test_a_seed_in_two_runs_is_an_error(out):
         load(out)
 
 
-def test_a_line_cut_off_is_left_out_and_a_damaged_one_is_an_error(out):
+def test_a_line_cut_off_is_left_out_and_so_is_a_damaged_one(out, capsys):
     log = out / "laptop-count" / "metrics.jsonl"
     whole = log.read_text()
     log.write_text(whole[:-20])
     text, _ = report_of(out)
     assert "last line of laptop-count/metrics.jsonl is cut off" in text
     assert "explored 3 trials (seeds 0, 1) and 2 trials (seeds 2)" in text
-    log.write_text("{]\n" + whole)
-    with pytest.raises(UsageError, match=r"metrics\.jsonl:1 is no row"):
-        load(out)
+    rows = load(out)
+    log.write_text("{]\n" + whole[:-20])
+    assert load(out) == rows
+    assert f"warning: {log}:1 is no row of a run (Exp" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, r"does not exist or is not a file"),
+        ("[]", r"is no config of a run \(Expected `object`, got `array`\)\. Restore"),
+        ('{"arm": "best"}', r"is no config of a run \(.* missing required field `pres"),
+        ('{"preset": "x/../../y"}', r"is no config of a run \(.* at `\$\.preset`\)"),
+        ('{"preset": "x", "tag": "/y"}', r"is no config of a run \(.* at `\$\.tag`\)"),
+        ('{"preset": "x", "preset": "y"}', r"cannot be read \('preset' is there twice"),
+    ],
+)
+def test_a_config_that_is_none_is_named(out, text, words):
+    """And never the row, which is good; nor is anything written elsewhere."""
+    path = out / "laptop-count" / "config.json"
+    path.unlink() if text is None else path.write_text(text)
+    before = sorted(out.rglob("*"))
+    with pytest.raises(CheckpointError, match=f"{path} {words}"):
+        write_report(out, out / "report")
+    assert sorted(out.rglob("*")) == before
 
 
 @pytest.mark.parametrize("made", [True, False])

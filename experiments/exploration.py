@@ -1,0 +1,70 @@
+"""What exploration saves: its form, and the room for transitions that it has."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+
+import jaxpets
+from experiments.build import EXPLORE, Parts, State, build, trial_keys
+from experiments.config import Config
+
+
+def template(config: Config, parts: Parts) -> State:
+    """Returns what exploration saves, `[S]`, as shapes."""
+    init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
+    return jax.eval_shape(init, trial_keys(config, EXPLORE, 0))
+
+
+def as_saved(config: Config, parts: Parts) -> Callable[[Mapping[str, Any]], State]:
+    """Returns what makes `template` of the leaves of a checkpoint, with its room.
+
+    That is less where the run was given more trials later, more where it was given
+    fewer.
+    """
+
+    def saved(leaves: Mapping[str, Any]) -> State:
+        rows = leaves.get("dataset/data/obs")  # a model may be there without its data
+        count = rows["shape"][1] // config.trial_length if rows else config.num_trials
+        if count == config.num_trials:
+            return template(config, parts)
+        found = dataclasses.replace(config, num_trials=count)
+        return template(found, build(found))
+
+    return saved
+
+
+def with_room(
+    state: State, capacity: int, reward_data: jaxpets.RewardData | None = None
+) -> State:
+    """Returns a learner `[S]` with room for as many transitions, or for more.
+
+    Args:
+      state: a learner.
+      capacity: of each seed.
+      reward_data: made anew, since it may have a row per transition; None keeps it.
+    """
+    if state.dataset.data.obs.shape[1] >= capacity:
+        return state
+
+    def grown(state: State) -> State:
+        dataset = jaxpets.datasets.grow(state.dataset, capacity)
+        state = state._replace(dataset=dataset)
+        if reward_data is None:
+            return state
+        reward = reward_data.refresh(state.reward, state.params, dataset)
+        return state._replace(reward=reward)
+
+    axes = jaxpets.SEED_AXES
+    return jax.vmap(grown, (axes,), axes)(state)
+
+
+def model_of(state: State) -> State:
+    """Returns what planning needs of a learner, with nothing in the other places."""
+    return jax.tree.map(lambda _: None, state)._replace(params=state.params)
+
+
+def data_of(state: State) -> State:
+    """Returns the dataset of a learner, with nothing in the other places."""
+    return jax.tree.map(lambda _: None, state)._replace(dataset=state.dataset)

@@ -1,0 +1,151 @@
+"""How a run is stopped from outside: the first signal asks, and has a deadline.
+
+Python calls a handler between two of its own steps, which is after a program of XLA has
+been compiled or has run. A thread that sleeps until a signal comes keeps the deadline.
+It leaves without Python's shutdown, which programs that still run can crash; to what is
+saved that is a kill, which loses nothing.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+from typing import Any, NoReturn
+
+from experiments.errors import InterruptedRun, StorageError, last_line
+
+_URGENT = (signal.SIGINT, signal.SIGTERM)  # if they come again
+_SIGNALS = (*_URGENT, signal.SIGHUP)  # of which a terminal that closes sends several
+
+
+class Stop:
+    """What is to be done where a run does not stop in time."""
+
+    def __init__(self) -> None:
+        self.seconds = 4.0
+        """How long it has, from the first signal on."""
+        self.tell: Callable[[str], None] = lambda reason: None
+        """Called with the reason, from another thread, before the process ends."""
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[Stop]:
+    """Turns the first signal into InterruptedRun, or into the end of the process.
+
+    That is SIGINT, SIGTERM or SIGHUP, wherever the program is, for as long as this is
+    held. `first_signal`, inside, may do something else with it. What is not left within
+    seconds is ended: the process tells the Stop, and exits with the code of
+    InterruptedRun. A second signal ends it at once.
+    """
+
+    def stop(number: int) -> None:
+        raise InterruptedRun(signal.Signals(number).name)
+
+    late = Stop()
+    with _watched(late), _unheard(), first_signal(stop):
+        yield late
+
+
+@contextlib.contextmanager
+def first_signal(act: Callable[[int], None]) -> Iterator[None]:
+    """Calls `act` with the first signal, when Python can; a second ends the process."""
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        del frame
+        for name in names:
+            again = signal.SIG_DFL if name in _URGENT else signal.SIG_IGN
+            signal.signal(name, again)
+        act(number)
+
+    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN  # as under nohup
+    names = _SIGNALS if hangs_up else _URGENT
+    before = [signal.signal(name, handler) for name in names]
+    try:
+        yield
+    finally:
+        for name, old in zip(names, before, strict=True):
+            signal.signal(name, old)
+
+
+def say(text: str) -> None:
+    """Prints a last line for the user, who may be gone."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def leave(code: int) -> NoReturn:
+    """Ends the process, without a shutdown where it did not end well."""
+    if not code:
+        sys.exit(0)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
+
+
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
+    """Keeps Python from printing a traceback where InterruptedRun gets nowhere.
+
+    That is in callbacks, as those of its garbage collector. The deadline still holds.
+    """
+    before = sys.unraisablehook
+
+    def hook(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, InterruptedRun):
+            before(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+@contextlib.contextmanager
+def _watched(late: Stop) -> Iterator[None]:
+    """Has a thread end the process some time after the first signal, unless over."""
+    told, woken = socket.socketpair()
+    woken.setblocking(False)
+    before = signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
+    thread = threading.Thread(target=_watch, args=(told, late), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        woken.close()  # ends the thread
+        thread.join()
+        told.close()
+
+
+def _watch(told: socket.socket, late: Stop) -> None:
+    first = _next(told, _SIGNALS)
+    if first is None:
+        return
+    told.settimeout(late.seconds)
+    try:
+        second = _next(told, _URGENT)
+    except TimeoutError:
+        error = InterruptedRun(first.name)
+        with contextlib.suppress(StorageError):
+            late.tell(first.name)
+        say(last_line(error))
+        leave(error.exit_code)
+    else:
+        if second is not None:  # and no handler was called, which lets it end us
+            os._exit(128 + second)
+
+
+def _next(
+    told: socket.socket, wanted: Sequence[signal.Signals]
+) -> signal.Signals | None:
+    """Returns the next signal of these, None if no more come."""
+    while number := told.recv(1):
+        if number[0] in wanted:
+            return signal.Signals(number[0])
+    return None

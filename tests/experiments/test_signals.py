@@ -1,0 +1,120 @@
+"""How a run is stopped: by its first signal, in time, or else without it."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments import signals
+from experiments.errors import InterruptedRun
+from experiments.progress import Progress
+
+ROOT = Path(__file__).parents[2]
+# A lock that is taken twice: as a program of XLA, it keeps Python from its handlers.
+STUCK = """
+    import ctypes
+    import sys
+    from experiments import signals
+    with signals.stoppable() as late:
+        late.seconds = float(sys.argv[1])
+        late.tell = lambda reason: print(f"told {reason}", flush=True)
+        mutex = ctypes.create_string_buffer(128)
+        print("stuck", flush=True)
+        for _ in range(2):
+            ctypes.CDLL(None).pthread_mutex_lock(mutex)
+"""
+
+
+@pytest.fixture
+def hung_up():
+    """Restores what a terminal that closes does to this process."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_stops_what_is_stoppable(name, hung_up):
+    number = signal.Signals[name]
+    before = signal.getsignal(number)
+    with pytest.raises(InterruptedRun, match=name), signals.stoppable():
+        try:
+            os.kill(os.getpid(), number)
+        finally:  # a second signal would end the process, unless a terminal closes
+            assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    assert signal.getsignal(number) is before
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_what_nohup_ignores_stays_ignored(hung_up):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with signals.stoppable():
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+def test_a_loop_stops_at_its_next_tick():
+    done = []
+    progress = Progress(10, 0, "walk")
+    stopped = pytest.raises(InterruptedRun, match="SIGTERM")
+    with stopped, signals.stoppable(), progress.interruptible():
+        os.kill(os.getpid(), signal.SIGTERM)
+        done.append("the step under way")
+        progress.tick(5)
+        done.append("the next")
+    assert done == ["the step under way"]
+
+
+def test_a_tick_that_does_not_come_is_not_waited_for(monkeypatch, capsys):
+    told, left = [], threading.Event()
+    monkeypatch.setattr(signals, "leave", lambda code: (told.append(code), left.set()))
+    with signals.stoppable() as late, Progress(10, 0, "walk").interruptible():
+        late.seconds, late.tell = 0.1, told.append
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert left.wait(20)
+    assert told == ["SIGTERM", 75]
+    err = capsys.readouterr().err
+    assert err.startswith("stopped: SIGTERM; ") and "same command" in err
+
+
+def test_what_cannot_be_raised_is_not_printed(capsys):
+    class Last:
+        def __del__(self):
+            raise InterruptedRun("SIGTERM")
+
+    with signals.stoppable():
+        Last()
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "sent", "code", "said"),
+    [
+        (0.2, [signal.SIGHUP, signal.SIGHUP], 75, "told SIGHUP\n"),
+        (60, [signal.SIGTERM, signal.SIGINT], 128 + signal.SIGINT, ""),
+    ],
+    ids=["deadline", "second"],
+)
+def test_a_process_that_is_stuck_ends(seconds, sent, code, said):
+    child = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(STUCK), str(seconds)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "stuck\n"
+    for number in sent:
+        time.sleep(0.05)
+        child.send_signal(number)
+    out, err = child.communicate(timeout=30)
+    assert (child.returncode, out) == (code, said), err
+    assert err.startswith("stopped: SIGHUP; ") if code == 75 else err == ""
