@@ -82,8 +82,9 @@ def lock(run_dir: Path) -> Iterator[None]:
             "host": socket.gethostname(),
             "start": time.strftime("%Y-%m-%d %H:%M:%S"),
         }
-        os.ftruncate(file, 0)
-        os.pwrite(file, json.dumps(owner).encode(), 0)
+        with storage_errors(f"lock {run_dir}"):
+            os.ftruncate(file, 0)
+            os.pwrite(file, json.dumps(owner).encode(), 0)
         yield
 
 
