@@ -12,9 +12,9 @@ import jax
 
 import jaxpets
 from benchmarks import rows, timing, workloads
-from jaxpets.envs import half_cheetah
+from benchmarks.env import ENGINES
 
-COLUMNS = ("precision", "seeds", "steps", "rows", "compile_s", "unroll_s",
+COLUMNS = ("engine", "precision", "seeds", "steps", "rows", "compile_s", "unroll_s",
            "ms_per_step", "fit_s", "trial_s")  # fmt: skip
 
 
@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         learn = time_fit(size, keys, num_rows, repeats)
         sizes = {
             **dataclasses.asdict(size),
+            "engine": args.engine,
             "precision": args.precision,
             "optimizer": args.optimizer,
             "seeds": seeds,
@@ -58,7 +59,7 @@ def time_unroll(
     repeats: int,
 ) -> timing.Timing:
     """Times reset and `steps` steps of planning and acting."""
-    env = half_cheetah.half_cheetah()
+    env = ENGINES[args.engine]()
     planner = workloads.planner(size, args.precision, args.optimizer)
     prepare = jax.vmap(lambda key: workloads.plan_params(size, key, "epistemic"))
     params = jax.jit(prepare)(keys)
@@ -89,6 +90,9 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     workloads.add_size_flag(parser)
     parser.add_argument(
         "--precision", choices=workloads.PRECISIONS, default="bf16", help="of planning"
+    )
+    parser.add_argument(
+        "--engine", choices=ENGINES, default="mjx", help="of the physics"
     )
     parser.add_argument("--optimizer", choices=workloads.OPTIMIZERS, default="cem")
     parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1])

@@ -7,17 +7,14 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+import runs
 from runs import learner, rows
 
-from experiments import cli
 from experiments.run import main
 from experiments.storage import checkpoint, rundir
 from jaxpets.envs import half_cheetah
@@ -32,20 +29,9 @@ FIT = {
 
 
 def start(*flags):
-    """Starts a run in a process of its own; all share what they compile."""
-    env = {
-        "PYTHONPATH": str(Path(cli.__file__).resolve().parents[1]),
-        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
-        "MUJOCO_GL": "crayons",  # only a video may mind
-    }
-    return subprocess.Popen(
-        [sys.executable, "-m", "experiments.run", *map(str, flags)],
-        env=os.environ | env,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    """Starts a run in a process of its own, where only a video may mind the GL."""
+    run = ("-m", "experiments.run", *flags)
+    return runs.start(*run, variables={"MUJOCO_GL": "crayons"})
 
 
 def finish(process):

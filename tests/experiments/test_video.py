@@ -1,11 +1,10 @@
 """The video of a trial: rendered for real where OpenGL works."""
 
-import os
 import subprocess
-import sys
 
 import numpy as np
 import pytest
+import runs
 
 from experiments.errors import RunError, UsageError
 from experiments.tools import video
@@ -33,14 +32,10 @@ def npz(tmp_path):
 
 
 def command(*args):
-    root = os.path.dirname(os.path.dirname(video.__file__))
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.tools.video", *map(str, args)],
-        env=os.environ | {"PYTHONPATH": root},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    """Returns the exit code of the command, and what it said on stderr."""
+    process = runs.start("-m", "experiments.tools.video", *args)
+    errors = process.communicate(timeout=100)[1]
+    return process.returncode, errors
 
 
 def require_gl(error):
@@ -155,14 +150,14 @@ def test_load_trial_refuses_what_is_no_trajectory(npz, tmp_path):
 )
 def test_bad_flags_exit_with_2_and_one_line(npz, tmp_path, flags, message):
     target = tmp_path / "a.mp4"
-    done = command(npz, target, "--task", "forward", "--seed", "4", *flags)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    code, errors = command(npz, target, "--task", "forward", "--seed", "4", *flags)
+    assert code == 2
+    assert message in errors
+    assert errors.count("\n") == 1
     assert not target.exists()
 
 
 def test_the_target_must_be_an_mp4(npz, tmp_path):
-    done = command(npz, tmp_path / "a.avi", "--task", "forward", "--seed", "4")
-    assert done.returncode == 2
-    assert "must end in .mp4" in done.stderr
+    code, errors = command(npz, tmp_path / "a.avi", "--task", "forward", "--seed", "4")
+    assert code == 2
+    assert "must end in .mp4" in errors

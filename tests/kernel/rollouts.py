@@ -12,8 +12,23 @@ import pytest
 import jaxpets
 from jaxpets import Precision
 from jaxpets._src.fused_rollout import rollout_of_kind
+from jaxpets._src.kernel import build
 from jaxpets._src.kernel.build import Kind
 from jaxpets.envs import half_cheetah as hc
+
+_real = build._compiler
+
+
+def _plain_compiler(kind):
+    """Optimises little, as these kernels run once: it saves half of the time.
+
+    Runs of the experiments, in processes of their own, have kernels as a user has.
+    """
+    return _real(kind) if kind is Kind.GPU else [*_real(kind), "-O1"]
+
+
+# In every process that imports this: all of them are to build the same kernels.
+build._compiler = _plain_compiler
 
 
 def _features(obs):

@@ -1,8 +1,11 @@
 """Which compiler is taken, and what is said of one that fails."""
 
 import os
+import re
+import select
 import shlex
 import shutil
+import subprocess
 import sys
 
 import pytest
@@ -50,6 +53,62 @@ def test_a_failure_leaves_nothing_behind(cache, compiler, said, words):
     with pytest.raises(BuildError, match=words):
         load("// one", Kind.GPU_REFERENCE)
     assert list(cache.iterdir()) == []
+
+
+@pytest.fixture
+def hanging(monkeypatch, tmp_path, compiler):
+    """Makes a compiler that never ends; `then` is called when one would wait for it.
+
+    It starts another program. Both hold a pipe, which has an end once they have.
+    Returns a function that reads the pipe.
+    """
+    file = tmp_path / "pipe"
+    os.mkfifo(file)
+    pipe = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
+    communicate = subprocess.Popen.communicate
+
+    def read():
+        assert select.select([pipe], [], [], 30)[0], "something still runs"
+        return os.read(pipe, 100)
+
+    def install(name, then):
+        compiler(f"exec 3> {file}; echo ready >&3; sleep 600 & wait", name=name)
+
+        def called(process, timeout):
+            if "-o" not in process.args:  # asked for its version
+                return communicate(process, timeout=timeout)
+            assert read() == b"ready\n"
+            return then(lambda: communicate(process, timeout=0))
+
+        monkeypatch.setattr(subprocess.Popen, "communicate", called)
+        return read
+
+    yield install
+    os.close(pipe)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "limit"),
+    [(Kind.GPU_REFERENCE, "c++", 120), (Kind.GPU, "nvcc", 300)],
+)
+def test_a_compiler_that_hangs_is_ended(cache, hanging, kind, name, limit):
+    read = hanging(name, lambda communicate: communicate())
+    words = f"^{re.escape(name)} was not done in {limit} seconds$"
+    with pytest.raises(BuildError, match=words):
+        load("// one", kind)
+    assert read() == b"" and not any(cache.iterdir())
+
+
+def test_an_interrupt_ends_the_compiler(cache, hanging):
+    """It is in another process group, where a terminal's interrupt does not come."""
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    read = hanging("c++", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        load("// one", Kind.GPU_REFERENCE)
+    assert read() == b"" and not any(cache.iterdir())
 
 
 def test_a_broken_library_says_so(compiler, registered):

@@ -144,7 +144,8 @@ def test_learning_alone_equals_its_half_of_a_trial(key):
     after, metrics = jax.jit(LEARNER.learn)(key, state, transitions)
     dataset = jaxpets.datasets.append(state.dataset, transitions)
     want = jax.jit(FITTER.step)(state.params, key, state.fit, dataset)
-    toys.assert_trees_close((after.params, after.fit, metrics), want, rtol=0)
+    # Two programs, whose sums XLA may order differently.
+    toys.assert_trees_close((after.params, after.fit, metrics), want, atol=1e-6)
     toys.assert_trees_close(after.dataset, dataset, rtol=0)
 
 

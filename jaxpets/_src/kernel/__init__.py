@@ -10,6 +10,7 @@ The code. What depends on the model is generated into model.h, all else is fixed
     sizes -> constants                       {gpu,cpu}_layout.header
     widths -> tensor core instructions       gpu_layout.products
     model.h and sources -> .so -> FFI target    build.load_kernel
+    .so -> the next process                     cache.library
 
 The numbers. Parameters are packed once per plan, and handed over at every call:
 

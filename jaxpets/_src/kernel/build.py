@@ -1,5 +1,6 @@
 """Compiling the kernel for one model, once, and handing it to XLA."""
 
+import contextlib
 import ctypes
 import enum
 import functools
@@ -10,14 +11,18 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
-import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
+from jaxpets._src.kernel import cache
+
 _SYMBOL = "jaxpets_rollout"
+# Seconds until a compiler is ended. A kernel takes five, and half a minute on a GPU.
+_LIMIT, _GPU_LIMIT = 120.0, 300.0
 
 
 class Kind(enum.Enum):
@@ -43,7 +48,7 @@ class Kernel(NamedTuple):
 def load_kernel(model: str, kind: Kind) -> Kernel:
     """Compiles the rollout for a model and registers it with XLA.
 
-    The library is kept in the user's cache folder and found there by the next process.
+    The library is kept for the next process, see `cache`.
 
     Args:
       model: the text of `model.h`.
@@ -52,6 +57,8 @@ def load_kernel(model: str, kind: Kind) -> Kernel:
     Raises:
       BuildError: if it cannot be built.
     """
+    if os.name != "posix":
+        raise BuildError("kernels are built on Linux and macOS only")
     compiler = _compiler(kind)
     version = _version(compiler[0])
     recipe = [jax.__version__, *compiler, version]
@@ -61,16 +68,12 @@ def load_kernel(model: str, kind: Kind) -> Kernel:
     sources = {**_shipped_sources(), "model.h": model}
     digest = hashlib.sha256("\0".join([*recipe, *sources.values()]).encode())
     target = f"{_SYMBOL}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
-    library = _cache_folder() / f"{target}.so"
+    make = functools.partial(_compile, compiler, sources, kind)
     try:
-        if not library.exists():
-            _compile(compiler, sources, kind.value, library)
+        with cache.library(target, make) as library:
+            handler = _loaded(library)
     except OSError as error:
-        raise BuildError(f"cannot write to the cache folder: {error}") from error
-    try:
-        handler = getattr(ctypes.CDLL(str(library)), _SYMBOL)
-    except OSError as error:
-        raise BuildError(f"cannot load the compiled kernel: {error}") from error
+        raise BuildError(f"there is no folder to build it in: {error}") from error
     where = "CUDA" if kind is Kind.GPU else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
     return Kernel(target, version)
@@ -88,44 +91,59 @@ def _shipped_sources() -> dict[str, str]:
 
 
 def _compile(
-    compiler: list[str], sources: dict[str, str], main: str, library: Path
-) -> None:
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as name:
-        folder = Path(name)
-        for file, text in sources.items():
-            (folder / file).write_text(text)
-        built = folder / library.name
-        include = [f"-I{name}", f"-I{jax.ffi.include_dir()}"]
-        command = [*compiler, *include, "-o", str(built), str(folder / main)]
-        _run(command)
-        os.replace(built, library)  # whole or not at all, with others building too
+    compiler: list[str], sources: dict[str, str], kind: Kind, folder: Path
+) -> Path:
+    """Compiles in an empty folder and returns the library's file."""
+    for file, text in sources.items():
+        (folder / file).write_text(text)
+    library = folder / "library.so"
+    include = [f"-I{folder}", f"-I{jax.ffi.include_dir()}"]
+    command = [*compiler, *include, "-o", str(library), str(folder / kind.value)]
+    _run(command, _GPU_LIMIT if kind is Kind.GPU else _LIMIT)
+    return library
 
 
-def _run(command: list[str]) -> str:
+def _loaded(library: Path) -> Any:
+    """Returns the kernel of a library as a function of C."""
+    try:
+        return getattr(ctypes.CDLL(str(library)), _SYMBOL)
+    except (OSError, AttributeError) as error:
+        raise BuildError(f"cannot load the compiled kernel: {error}") from error
+
+
+def _run(command: list[str], limit: float) -> str:
     """Returns what a compiler prints.
 
     Raises:
-      BuildError: if it cannot be run, or fails.
+      BuildError: if it cannot be run, fails, or takes more than `limit` seconds.
     """
     name = Path(command[0]).name
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        # In a process group of its own: what the compiler starts ends with it.
+        with subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            process_group=0,
+        ) as process:
+            try:
+                output, said = process.communicate(timeout=limit)
+            except BaseException:  # the user's interrupt too: it reaches us alone
+                with contextlib.suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                raise
+    except subprocess.TimeoutExpired as error:
+        raise BuildError(f"{name} was not done in {limit:g} seconds") from error
     except OSError as error:
         raise BuildError(f"cannot run {name}: {error}") from error
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if "error" in line]
-        first = (lines or done.stderr.splitlines() or ["no message"])[0]
+    if process.returncode:
+        lines = [line for line in said.splitlines() if "error" in line]
+        first = (lines or said.splitlines() or ["no message"])[0]
         raise BuildError(f"{name} failed: {first}")
-    return done.stdout
-
-
-def _cache_folder() -> Path:
-    try:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError as error:
-        raise BuildError("there is no home folder; set XDG_CACHE_HOME") from error
-    return Path(home) / "jaxpets"
+    return output
 
 
 def _compiler(kind: Kind) -> list[str]:
@@ -149,7 +167,7 @@ def _host_compiler() -> list[str]:
 
 def _version(compiler: str) -> str:
     """Returns a compiler's name and version, as it says them."""
-    lines = _run([compiler, "--version"]).splitlines()
+    lines = _run([compiler, "--version"], _LIMIT).splitlines()
     named = (line.strip() for line in lines if re.search(r"\d\.\d", line))
     return next(named, "unknown")
 
@@ -161,7 +179,7 @@ def _processor(compiler: list[str]) -> str:
       BuildError: if it does not know the processor, or that cannot multiply and add at
         once, without which every step of a polynomial is a call.
     """
-    defined = _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull])
+    defined = _run([*compiler, "-E", "-dM", "-x", "c++", os.devnull], _LIMIT)
     if not re.search(r"\b(__FMA__|__ARM_FEATURE_FMA)\b", defined):
         raise BuildError("the processor has no fused multiply-add")
     return defined
