@@ -70,20 +70,21 @@ def lock(run_dir: Path) -> Iterator[None]:
         disk.make(run_dir)
     # Never unlinked: a waiting process may have it open already.
     with disk.opened(run_dir / ".lock", os.O_RDWR) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CheckpointError(
-                f"{run_dir} is in use by {_holder(file)}. Stop it or choose another "
-                "run directory."
-            ) from None
-        owner = {
-            "pid": os.getpid(),
-            "host": socket.gethostname(),
-            "start": time.strftime("%Y-%m-%d %H:%M:%S"),
-        }
-        os.ftruncate(file, 0)
-        os.pwrite(file, json.dumps(owner).encode(), 0)
+        with storage_errors(f"lock {run_dir}"):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise CheckpointError(
+                    f"{run_dir} is in use by {_holder(file)}. Stop it or choose "
+                    "another run directory."
+                ) from None
+            owner = {
+                "pid": os.getpid(),
+                "host": socket.gethostname(),
+                "start": time.strftime("%Y-%m-%d %H:%M:%S"),
+            }
+            os.ftruncate(file, 0)
+            os.pwrite(file, json.dumps(owner).encode(), 0)
         yield
 
 

@@ -121,6 +121,16 @@ def test_a_lock_is_never_followed_elsewhere(tmp_path):
     assert (tmp_path / "precious").read_text() == "data"
 
 
+def test_a_lock_on_a_failing_disk(tmp_path, monkeypatch):
+    def fail(_file, _size):
+        raise OSError(5, os.strerror(5))
+
+    monkeypatch.setattr(os, "ftruncate", fail)
+    words = "cannot lock .* \\(Input/output error\\)"
+    with pytest.raises(StorageError, match=words), rundir.lock(tmp_path):
+        raise AssertionError("it is not locked")
+
+
 # The disk.
 
 
