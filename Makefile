@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs
 PYTEST_FLAGS ?=
 
-.PHONY: explore results test lint clean
+.PHONY: explore results test faults lint clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -28,6 +28,10 @@ results: $(VENV)/.installed
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)
+
+# Hours: what is lost where anything fails while a run writes. See results/faults.md.
+faults: $(VENV)/.installed
+	PYTHONPATH=.:tests $(BIN)/python -m faults.bench $(FAULTS)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .

@@ -204,16 +204,18 @@ def _without_gl() -> Iterator[None]:
             os.environ["MUJOCO_GL"] = chosen
 
 
-def _command() -> NoReturn:
+def command() -> NoReturn:
+    """Runs `main` as a program, and leaves."""
     code: Any = 1
-    try:
-        code = main()
-    except SystemExit as error:
-        code = error.code
-    except BaseException:
-        traceback.print_exc()
-    signals.leave(code)
+    with signals.unheard():  # to the very end: threads of a failed save come last
+        try:
+            code = main()
+        except SystemExit as error:
+            code = error.code
+        except BaseException:
+            traceback.print_exc()
+        signals.leave(code)
 
 
 if __name__ == "__main__":
-    _command()
+    command()

@@ -46,7 +46,7 @@ def stoppable() -> Iterator[Stop]:
         raise InterruptedRun(signal.Signals(number).name)
 
     late = Stop()
-    with _watched(late), _unheard(), first_signal(stop):
+    with _watched(late), unheard(), first_signal(stop):
         yield late
 
 
@@ -71,6 +71,28 @@ def first_signal(act: Callable[[int], None]) -> Iterator[None]:
             signal.signal(name, old)
 
 
+@contextlib.contextmanager
+def unheard() -> Iterator[None]:
+    """Keeps Python from printing tracebacks of what gets nowhere and means nothing.
+
+    InterruptedRun in callbacks, as those of its garbage collector: the deadline still
+    holds. And what TensorStore's threads come upon when a save has failed before they
+    were done: the save has said why.
+    """
+    before = sys.unraisablehook
+
+    def hook(unraisable: Any) -> None:
+        late = str(unraisable.exc_value) == "Event loop is closed"
+        if not late and not issubclass(unraisable.exc_type, InterruptedRun):
+            before(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
 def say(text: str) -> None:
     """Prints a last line for the user, who may be gone."""
     with contextlib.suppress(OSError, ValueError):
@@ -85,25 +107,6 @@ def leave(code: int) -> NoReturn:
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     os._exit(code)
-
-
-@contextlib.contextmanager
-def _unheard() -> Iterator[None]:
-    """Keeps Python from printing a traceback where InterruptedRun gets nowhere.
-
-    That is in callbacks, as those of its garbage collector. The deadline still holds.
-    """
-    before = sys.unraisablehook
-
-    def hook(unraisable: Any) -> None:
-        if not issubclass(unraisable.exc_type, InterruptedRun):
-            before(unraisable)
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
 
 
 @contextlib.contextmanager

@@ -77,10 +77,11 @@ def _chain(args: argparse.Namespace, out: Path, steps: list[list[str]]) -> Any:
         )  # fmt: skip
         if done.returncode:
             return {"failed": " ".join(flags), "stderr": done.stderr[-2000:]}
-    return dict(_digests(out))
+    return dict(found_in(out))
 
 
-def _digests(out: Path) -> Iterator[tuple[str, str]]:
+def found_in(out: Path) -> Iterator[tuple[str, str]]:
+    """Yields names and digests of all logs and checkpoints below a folder."""
     for log in sorted(out.rglob("metrics.jsonl")):
         rows = [json.loads(line) for line in log.read_text().splitlines()]
         text = json.dumps([_comparable(row) for row in rows], sort_keys=True)

@@ -316,7 +316,7 @@ def test_kill_during_a_save(tmp_path):
     command = [sys.executable, "-c", textwrap.dedent(KILLED), str(tmp_path)]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     step = 0
-    for _ in range(5):
+    for _ in range(3):
         child = subprocess.Popen(
             [*command, str(step)], env=env, stdout=subprocess.PIPE, text=True
         )

@@ -23,7 +23,7 @@ def test_digests_leave_out_the_time_and_old_names(tmp_path):
     for name, seconds in (("loss", 1.0), ("nll", 2.0)):
         row = {"trial": 1, "fit": {name: 0.5}, "seconds": {"act": seconds}}
         (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
-        found.append(dict(digests._digests(tmp_path)))
+        found.append(dict(digests.found_in(tmp_path)))
     assert found[0] == found[1]
     assert {"run/checkpoints/1:a", "run/checkpoints/1:b", "run/metrics.jsonl"} == set(
         found[0]
@@ -35,7 +35,7 @@ def test_digests_see_a_bit(tmp_path):
     for step, value in enumerate((1.0, np.nextafter(np.float32(1.0), 2.0)), start=1):
         folder = tmp_path / str(step) / "checkpoints"
         checkpoint.save(folder, 7, {"a": jnp.float32(value)}, {})
-        found += dict(digests._digests(tmp_path / str(step))).values()
+        found += dict(digests.found_in(tmp_path / str(step))).values()
     assert len(set(found)) == 2
 
 

@@ -153,23 +153,6 @@ def test_a_refit_that_would_take_minutes_stops_in_time(again):
 
 
 @pytest.mark.slow
-def test_a_damaged_checkpoint_costs_one_trial(straight, again):
-    data = max(
-        (again / "checkpoints" / str(TRIAL)).rglob("*"),
-        key=lambda path: path.stat().st_size if path.is_file() else 0,
-    )
-    raw = bytearray(data.read_bytes())
-    raw[len(raw) // 2] ^= 1
-    data.write_bytes(raw)
-    code, errors = finish(start(*SMOKE, "--out", again.parent))
-    assert code == 0
-    first, second, _ = errors.splitlines()
-    assert first.startswith("warning: checkpoint 3 is damaged") and "using 2" in first
-    assert second.startswith("explore 3/3")
-    assert_same_run(again, straight[0])
-
-
-@pytest.mark.slow
 def test_a_finished_run_is_left_alone(again, capsys):
     before = contents(again)
     assert main([*SMOKE, "--out", str(again.parent)]) == 0

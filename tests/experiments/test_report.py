@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from small_logs import EXPLORED, explore_rows, write_run
 
 from experiments.errors import CheckpointError, UsageError
-from experiments.report import logs, task_sections
+from experiments.report import logs, style, task_sections
 from experiments.report.report import load, write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
@@ -74,7 +75,11 @@ def out(tmp_path):
 
 
 def report_of(out):
-    write_report(out, out / "report")
+    """Reports with figures that are small and have no layout, which takes the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(style.STYLE, "savefig.dpi", 30)
+        patch.setattr(style, "Figure", lambda figsize, layout: Figure(figsize))
+        write_report(out, out / "report")
     table = json.loads((out / "report" / "table1.json").read_text())
     return (out / "report" / "report.md").read_text(), table
 
