@@ -1,6 +1,6 @@
 """Whole runs of the preset smoke: real physics, real planning, real processes.
 
-Physics in C, which compiles in a third of the time; CI also runs every phase on MJX.
+Physics in C, which compiles in a third of the time; CI explores and performs on MJX.
 """
 
 import json
