@@ -73,6 +73,7 @@ def run(
     def collect(tree: Any) -> Any:
         return devices.collect(phase.placement, tree, *phase.axes)
 
+    folder.update(trial=done, num_trials=last)
     if done >= last:
         folder.say(f"already complete: {last - first} of {last - first} trials.")
         return False

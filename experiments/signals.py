@@ -12,11 +12,12 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import Any, NoReturn
 
-from experiments.errors import InterruptedRun, StorageError, last_line
+from experiments.errors import InterruptedRun, last_line
 
 _URGENT = (signal.SIGINT, signal.SIGTERM)  # if they come again
 _SIGNALS = (*_URGENT, signal.SIGHUP)  # of which a terminal that closes sends several
@@ -130,12 +131,11 @@ def _watch(told: socket.socket, late: Stop) -> None:
     first = _next(told, _SIGNALS)
     if first is None:
         return
-    told.settimeout(late.seconds)
     try:
-        second = _next(told, _URGENT)
+        second = _next(told, _URGENT, time.monotonic() + late.seconds)
     except TimeoutError:
         error = InterruptedRun(first.name)
-        with contextlib.suppress(StorageError):
+        with contextlib.suppress(Exception):  # nothing may keep it from leaving
             late.tell(first.name)
         say(last_line(error))
         leave(error.exit_code)
@@ -145,10 +145,18 @@ def _watch(told: socket.socket, late: Stop) -> None:
 
 
 def _next(
-    told: socket.socket, wanted: Sequence[signal.Signals]
+    told: socket.socket, wanted: Sequence[signal.Signals], end: float | None = None
 ) -> signal.Signals | None:
-    """Returns the next signal of these, None if no more come."""
-    while number := told.recv(1):
+    """Returns the next signal of these, None if no more come.
+
+    Raises:
+      TimeoutError: if none has come at `end`, whatever other signals have.
+    """
+    while True:
+        if end is not None:
+            told.settimeout(max(end - time.monotonic(), 1e-3))
+        number = told.recv(1)
+        if not number:
+            return None
         if number[0] in wanted:
             return signal.Signals(number[0])
-    return None

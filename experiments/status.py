@@ -63,7 +63,7 @@ def _row(run: Path) -> tuple[str, ...]:
     trial += f"/{found.num_trials}" if found.num_trials is not None else ""
     running, rate = found.state == status.RUNNING, found.steps_per_second
     speed = f"{rate:.1f}" if running and rate is not None else ""
-    left = _left(found.seconds_left)
+    left = _left(found.seconds_left) if running else ""
     return _cells(run, found.state, trial, speed, left, _said(found))
 
 

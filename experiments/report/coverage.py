@@ -70,7 +70,9 @@ def write(
     Raises:
       CheckpointError, StorageError: if the one cannot be read or the other written.
     """
-    if run.has_json(_FILE) and not anew:
+    found = run.find_json(_FILE)
+    # Of fewer trials where a run that was given more has died just before its end here.
+    if found and found.get("trial", step) == step and not anew:
         return
     dataset = run.restore_trial(step, template, part=True).dataset
     filled = np.asarray(dataset.data.next_obs)[:, : int(dataset.size)]
@@ -78,7 +80,7 @@ def write(
         seed: histogram(next_obs) for seed, next_obs in zip(seeds, filled, strict=True)
     }
     edges = {"velocity_edges": VELOCITY_EDGES, "pitch_rate_edges": PITCH_RATE_EDGES}
-    run.write_json(_FILE, {**edges, "counts": counts})
+    run.write_json(_FILE, {**edges, "trial": step, "counts": counts})
 
 
 def load(out: Path) -> dict[str, dict[str, Counts]]:

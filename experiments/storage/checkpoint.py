@@ -26,7 +26,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
 import jaxpets
-from experiments.errors import CheckpointError, DivergedError, StorageError
+from experiments.errors import CheckpointError, DivergedError, RunError, StorageError
 from experiments.storage import disk, pytrees, step_folders
 from experiments.storage.step_folders import broken, names, seal, steps
 
@@ -234,7 +234,7 @@ def _read(
     except PermissionError as error:
         what = f"cannot read checkpoint {number} in {directory} ({error.strerror})"
         raise StorageError(f"{what}. Check its permissions.") from error
-    except (MemoryError, CheckpointError, _DamagedError):
+    except (MemoryError, RunError, _DamagedError):  # a signal is none of its damage
         raise
     except Exception as error:
         raise _DamagedError(f"unreadable: {type(error).__name__}") from error

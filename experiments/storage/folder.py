@@ -55,9 +55,9 @@ class RunFolder(NamedTuple):
         """Returns the trials that have a checkpoint, oldest first."""
         return distributed.on_first(lambda: checkpoint.steps(self._checkpoints))
 
-    def has_json(self, name: str) -> bool:
-        """Returns whether there is an object in a file of this name."""
-        return distributed.on_first(lambda: bool(rundir.find_json(self.path / name)))
+    def find_json(self, name: str) -> dict[str, Any]:
+        """Returns the object in a file of this name, an empty one if there is none."""
+        return distributed.on_first(lambda: rundir.find_json(self.path / name))
 
     def has_trajectories(self) -> bool:
         """Returns whether what a video is made of is there, and whole."""
@@ -101,8 +101,12 @@ class RunFolder(NamedTuple):
         """
         found = self._restore(template, None, False)
         last, meta = (found[0], found[2]) if found else (first, {})
+        num_rows = meta.get("rows")
+        num_rows = (
+            num_rows if type(num_rows) is int else None
+        )  # a stranger's may not be
         for line in distributed.on_first(
-            lambda: metrics.resume(self._log, first, last, meta.get("rows"))
+            lambda: metrics.resume(self._log, first, last, num_rows)
         ):
             self.say(f"warning: {line}")
         return found[:2] if found else None

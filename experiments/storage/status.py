@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from experiments.errors import CheckpointError, StorageError
+from experiments.errors import CheckpointError, StorageError, storage_errors
 from experiments.storage import disk, rundir
 
 RUNNING, INTERRUPTED, FAILED, COMPLETE, KILLED = (
@@ -73,6 +73,7 @@ class Writer:
             state=RUNNING,
             reason="",
             phase=self._phase,
+            steps_per_second=None,
             seconds_left=None,
             pid=os.getpid(),
             host=socket.gethostname(),
@@ -144,7 +145,7 @@ def _write(path: Path, data: dict[str, Any]) -> None:
         rundir.write_json(path, data)
     except StorageError:
         text = msgspec.json.encode(data)
-        with disk.opened(path, os.O_WRONLY) as file:
+        with storage_errors(f"write {path}"), disk.opened(path, os.O_WRONLY) as file:
             os.pwrite(file, text, 0)
             os.ftruncate(file, len(text))
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from states import as_bytes, make_state, restore, save_two
 
-from experiments.errors import CheckpointError, StorageError
+from experiments.errors import CheckpointError, InterruptedRun, StorageError
 from experiments.storage import checkpoint, disk
 from experiments.storage.step_folders import SEAL, seal
 
@@ -332,3 +332,13 @@ def test_kill_during_a_save(tmp_path):
         assert step in (done, done + 1)  # Whole before its line was printed.
         assert meta == {"log": step}
         assert (np.asarray(state["w"]) == step).all()
+
+
+def test_a_signal_while_reading_damages_nothing(directory, monkeypatch):
+    def stopped(folder):
+        raise InterruptedRun("SIGTERM")
+
+    monkeypatch.setattr(checkpoint, "broken", stopped)
+    with pytest.raises(InterruptedRun):
+        restore(directory)
+    assert sorted(os.listdir(directory)) == ["1", "2"]

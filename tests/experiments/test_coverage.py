@@ -120,7 +120,8 @@ def go_on(folder):
 @pytest.mark.slow
 def test_a_complete_run_has_the_coverage_of_its_data(explored):
     data = json.loads((explored / "coverage.json").read_text())
-    assert set(data) == {"velocity_edges", "pitch_rate_edges", "counts"}
+    assert set(data) == {"velocity_edges", "pitch_rate_edges", "trial", "counts"}
+    assert data["trial"] == runs.LAST
     assert tuple(data["velocity_edges"]) == coverage.VELOCITY_EDGES
     assert tuple(data["pitch_rate_edges"]) == coverage.PITCH_RATE_EDGES
     assert list(data["counts"]) == [str(seed) for seed in SEEDS]
@@ -161,8 +162,11 @@ def test_a_complete_run_gets_what_is_missing_and_keeps_what_is_there(again, caps
     path.write_text('{"mine": 1}')
     assert go_on(again) == 0
     assert path.read_text() == '{"mine": 1}'
+    path.write_text('{"trial": 2}')  # from before the run was given a third
+    assert go_on(again) == 0
+    assert path.read_bytes() == written
     errors = capsys.readouterr().err
-    assert errors.count("already complete: 3 of 3 trials") == 2
+    assert errors.count("already complete: 3 of 3 trials") == 3
 
 
 @pytest.mark.slow

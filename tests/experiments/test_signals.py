@@ -75,8 +75,13 @@ def test_a_loop_stops_at_its_next_tick():
 def test_a_tick_that_does_not_come_is_not_waited_for(monkeypatch, capsys):
     told, left = [], threading.Event()
     monkeypatch.setattr(signals, "leave", lambda code: (told.append(code), left.set()))
+
+    def tell(reason):
+        told.append(reason)
+        raise OSError("the disk is full")  # which keeps nobody
+
     with signals.stoppable() as late, Progress(10, 0, "walk").interruptible():
-        late.seconds, late.tell = 0.1, told.append
+        late.seconds, late.tell = 0.1, tell
         os.kill(os.getpid(), signal.SIGTERM)
         assert left.wait(20)
     assert told == ["SIGTERM", 75]

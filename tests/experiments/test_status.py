@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from experiments import status as command
-from experiments.errors import CheckpointError
+from experiments.errors import CheckpointError, StorageError
 from experiments.storage import rundir, status
 
 
@@ -55,10 +55,30 @@ def test_a_process_of_another_host_may_run(tmp_path):
 
 
 def test_a_run_keeps_how_far_it_got(tmp_path):
-    folder = begun(tmp_path, trial=4, num_trials=6, state="interrupted", reason="x")
+    done = {"trial": 4, "num_trials": 6, "steps_per_second": 9.0}
+    folder = begun(tmp_path, **done, state="interrupted", reason="x")
     found = status.read(begun(folder))
     assert (found.state, found.reason) == ("running", "")
     assert (found.trial, found.num_trials) == (4, 6)
+    assert found.steps_per_second is None  # of this process
+
+
+def test_a_disk_that_refuses_everything_stops_nothing(tmp_path, monkeypatch):
+    writer = status.Writer(tmp_path, "explore")
+    writer.begin()
+
+    def refused(*args):
+        raise StorageError("no draft")
+
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(rundir, "write_json", refused)
+    monkeypatch.setattr(status.os, "pwrite", full)
+    writer.update(trial=5)
+    with pytest.raises(StorageError, match="No space left"):
+        writer.end(status.COMPLETE)
+    assert status.read(tmp_path).trial is None
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"state": 1}', '{"trial": 2}', "{", "\0"])
