@@ -85,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         folder = Path(name).resolve()
         with contextlib.closing(Bench(folder, args.jobs)) as bench:
             outcomes = list(_all(bench, args))
+        print(table(outcomes), flush=True)
         read = configs.damaged(args.configs, folder) if args.configs else {}
-    print(table(outcomes))
     print("\nDamaged configs:", ", ".join(f"{n} {what}" for what, n in read.items()))
     lost = [outcome for outcome in outcomes if outcome.wrong]
     for outcome in lost:

@@ -49,7 +49,9 @@ def texts(draw: st.DrawFn) -> bytes:
     data = json.loads(json.dumps(GOOD))
     for place in draw(st.lists(st.sampled_from(PLACES), min_size=1, max_size=2)):
         *groups, name = place
-        group = reduce(lambda x, y: x[y] if isinstance(x, dict) else {}, groups, data)
+        group = reduce(
+            lambda x, y: x.get(y) if isinstance(x, dict) else None, groups, data
+        )
         what = draw(st.sampled_from(["replace", "replace", "drop", "rename"]))
         value = group.pop(name, None) if isinstance(group, dict) else None
         if not isinstance(group, dict) or what == "drop":
