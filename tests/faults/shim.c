@@ -71,31 +71,25 @@ static int fault(const char *name, int writes, int folder, const char *path) {
   static result (*real)(__VA_ARGS__);                        \
   if (!real) real = (result(*)(__VA_ARGS__))dlsym(RTLD_NEXT, #name)
 
-#define OPEN(name)                                           \
-  int name(const char *path, int flags, ...) {               \
-    REAL(int, name, const char *, int, ...);                 \
-    va_list rest;                                            \
-    va_start(rest, flags);                                   \
-    mode_t mode = va_arg(rest, mode_t);                      \
-    va_end(rest);                                            \
-    int writes = flags & (O_CREAT | O_WRONLY | O_RDWR | O_TRUNC); \
-    if (fault(#name, !!writes, AT_FDCWD, path)) return -1;   \
-    return real(path, flags, mode);                          \
-  }
-OPEN(open)
-OPEN(open64)
-
-#define OPENAT(name)                                         \
-  int name(int folder, const char *path, int flags, ...) {   \
-    REAL(int, name, int, const char *, int, ...);            \
+#define OPENING(name, folder, types, values, ...)            \
+  int name types {                                           \
+    REAL(int, name, __VA_ARGS__);                            \
     va_list rest;                                            \
     va_start(rest, flags);                                   \
     mode_t mode = va_arg(rest, mode_t);                      \
     va_end(rest);                                            \
     int writes = flags & (O_CREAT | O_WRONLY | O_RDWR | O_TRUNC); \
     if (fault(#name, !!writes, folder, path)) return -1;     \
-    return real(folder, path, flags, mode);                  \
+    return real values;                                      \
   }
+#define OPEN(name)                                           \
+  OPENING(name, AT_FDCWD, (const char *path, int flags, ...), \
+          (path, flags, mode), const char *, int, ...)
+#define OPENAT(name)                                         \
+  OPENING(name, folder, (int folder, const char *path, int flags, ...), \
+          (folder, path, flags, mode), int, const char *, int, ...)
+OPEN(open)
+OPEN(open64)
 OPENAT(openat)
 OPENAT(openat64)
 

@@ -6,7 +6,7 @@ import os
 import signal
 
 import pytest
-from faults import bench, configs
+from faults import configs, lab
 
 KINDS = ("kill", "no space", "error", "signal", "flip")
 
@@ -15,7 +15,7 @@ KINDS = ("kill", "no space", "error", "signal", "flip")
 def explored(tmp_path_factory):
     jobs = 2 if os.cpu_count() else 1
     folder = tmp_path_factory.mktemp("faults").resolve()
-    with contextlib.closing(bench.Bench(folder, jobs, ("explore",))) as found:
+    with contextlib.closing(lab.Bench(folder, jobs, ("explore", "resume"))) as found:
         yield found
 
 
@@ -23,13 +23,13 @@ def explored(tmp_path_factory):
 def outcomes(explored):
     """Faults while the second checkpoint is written, all met at once."""
     writes, every = explored.operations["explore"]
-    middle = bench.Fault("", "explore")._replace
+    middle = lab.Fault("", "explore")._replace
     faults = [
-        middle(what=bench.KILL, at=writes // 2, number=errno.ENOSPC),
-        middle(what=bench.FROM_THEN_ON, at=writes // 2, number=errno.ENOSPC),
-        middle(what=bench.ONCE, at=every // 2, number=errno.EIO),
+        middle(what=lab.KILL, at=writes // 2, number=errno.ENOSPC),
+        middle(what=lab.FROM_THEN_ON, at=writes // 2, number=errno.ENOSPC),
+        middle(what=lab.ONCE, at=every // 2, number=errno.EIO),
         middle(signal=signal.SIGTERM, after=explored.seconds["explore"] / 2),
-        middle(damage=flip_largest),
+        middle(phase="resume", damage=flip_largest),
     ]
     return dict(zip(KINDS, explored.meet_all(faults, float("inf")), strict=True))
 
@@ -37,7 +37,7 @@ def outcomes(explored):
 def flip_largest(out):
     files = (path for path in out.rglob("checkpoints/2/**/*") if path.is_file())
     largest = max(files, key=lambda path: path.stat().st_size)
-    return bench.flip(out, str(largest.relative_to(out)), seed=0)
+    lab.flip(out, str(largest.relative_to(out)), seed=0)
 
 
 @pytest.mark.slow

@@ -1,0 +1,271 @@
+"""Runs that meet a fault, and are compared with one that met none."""
+
+import concurrent.futures
+import errno
+import hashlib
+import json
+import os
+import queue
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.tools import digests
+
+HERE = Path(__file__).parent
+COUNT, KILL, ONCE, FROM_THEN_ON = 1, 2, 3, 4  # as in shim.c
+LIMIT = 300.0  # seconds until a run counts as hung
+# Exit codes that are promised: done, a checkpoint's, the disk's, interrupted.
+PROMISED = (0, 3, 5, 75)
+NAME = "smoke-random"  # of the run: exploring at random is the quickest
+RUN = ["--preset", "smoke", "--arm", "random", "--engine", "mujoco"]
+EXPLORE = ["--phase", "explore", *RUN, "--milestones", "1", "2"]
+PHASES = {
+    "explore": EXPLORE,
+    "resume": EXPLORE,  # of a run whose last trial is missing
+    "zero-shot": ["--phase", "zero-shot", *RUN],
+    "finetune": ["--phase", "finetune", *RUN, "--task", "forward",
+                 "--refit.num-epochs", "1"],
+}  # fmt: skip
+
+
+class Fault(NamedTuple):
+    """What happens to one run."""
+
+    kind: str  # row of the table
+    phase: str
+    what: int = COUNT
+    at: int = 0
+    number: int = 0
+    signal: int | None = None
+    after: float = 0.0
+    damage: Callable[[Path], None] | None = None  # done to the folder before the run
+
+
+class Outcome(NamedTuple):
+    """What came of it; `wrong` says what is not as it should be."""
+
+    fault: Fault
+    met: bool  # whether the run came to the fault at all
+    wrong: str  # "", "not equal", "traceback", "hang" or "exit code"
+    code: int | None
+    said: str
+
+
+def flip(folder: Path, name: str, seed: int) -> None:
+    """Flips a bit of a file."""
+    path, random_ = folder / name, random.Random(seed)
+    data = bytearray(path.read_bytes())
+    if data:
+        data[random_.randrange(len(data))] ^= 1 << random_.randrange(8)
+        path.write_bytes(data)
+
+
+class Bench:
+    """Reference runs, servers that fork runs, and a folder for all of it."""
+
+    def __init__(
+        self, folder: Path, jobs: int, phases: Sequence[str] = tuple(PHASES)
+    ) -> None:
+        self._folder, self._jobs, self._phases = folder, jobs, phases
+        shim = folder / "shim.so"
+        flags = ["-std=c11", "-O1", "-shared", "-fPIC", "-o", shim, HERE / "shim.c"]
+        subprocess.run(["cc", *map(str, flags), "-ldl"], check=True)
+        self._servers: queue.Queue[Server] = queue.Queue()
+        for _ in range(jobs):
+            self._servers.put(Server(shim, folder / "jax-cache"))
+        self.operations: dict[str, tuple[int, int]] = {}
+        self.seconds: dict[str, float] = {}
+        self.wanted: dict[str, dict[str, str]] = {}
+        self.before: dict[str, Path] = {}
+        self._refer()
+
+    def close(self) -> None:
+        while not self._servers.empty():
+            self._servers.get().close()
+
+    def _refer(self) -> None:
+        """Runs every phase without a fault, on what the phases before it left."""
+        before = self._folder / "nothing"
+        (before / "out").mkdir(parents=True)
+        for phase in self._phases:
+            self.before[phase] = before
+            # Counting writes alone, then everything.
+            (one, writes, _), (other, every, seconds) = (
+                self._counted(phase, number) for number in (errno.ENOSPC, errno.EIO)
+            )
+            self.operations[phase], self.seconds[phase] = (writes, every), seconds
+            self.wanted[phase] = contents(other / "out")
+            same = contents(one / "out") == self.wanted[phase]
+            assert same, "two runs without a fault differ"
+            if phase == "explore":
+                before = self._folder / "two-trials"
+                shutil.copytree(other, before)
+                shutil.rmtree(before / "out" / NAME / "checkpoints" / "3")
+            else:
+                before = other if phase == "resume" else before
+
+    def _counted(self, phase: str, number: int) -> tuple[Path, int, float]:
+        """Runs a phase; where, how many operations a fault could meet, and seconds."""
+        folder = self._folder / f"{phase}-{number}"
+        ignored = shutil.ignore_patterns("list")
+        shutil.copytree(self.before[phase], folder, ignore=ignored)
+        found = self.start(folder, Fault("none", phase, number=number))
+        assert found["code"] == 0, found
+        count = len((folder / "list").read_text().splitlines())
+        return folder, count, found["seconds"]
+
+    def files(self) -> list[str]:
+        """Returns what is read of a run that goes on."""
+        out = self.before["resume"] / "out"
+        every = (str(x.relative_to(out)) for x in out.rglob("*") if x.is_file())
+        return [name for name in every if "checkpoints/1/" not in name]
+
+    def start(self, folder: Path, fault: Fault) -> dict[str, Any]:
+        """Runs a phase; the answer of `server` and what it said."""
+        server = self._servers.get()
+        try:
+            return server.run(folder, fault)
+        finally:
+            self._servers.put(server)
+
+    def meet_all(self, faults: Sequence[Fault], end: float) -> Iterator[Outcome]:
+        def meet(i: int) -> Outcome | None:
+            return self.meet(faults[i], i) if time.monotonic() < end else None
+
+        with concurrent.futures.ThreadPoolExecutor(self._jobs) as pool:
+            for outcome in pool.map(meet, range(len(faults))):
+                if outcome is not None:
+                    yield outcome
+
+    def meet(self, fault: Fault, number: int) -> Outcome:
+        """Lets a run meet a fault, runs it again, and compares."""
+        folder = self._folder / f"try-{number}"
+        shutil.copytree(self.before[fault.phase], folder)
+        if fault.damage:
+            fault.damage(folder / "out")
+        first = self.start(folder, fault)
+        again = self.start(folder, Fault("none", fault.phase))
+        met = fault.damage is not None or first["code"] != 0
+        wrong = self._judge(fault, first, again, folder)
+        shutil.rmtree(folder)
+        said = first["said"] + again["said"]
+        return Outcome(fault, met, wrong, again["code"], said)
+
+    def _judge(
+        self, fault: Fault, first: dict[str, Any], again: dict[str, Any], folder: Path
+    ) -> str:
+        if None in (first["code"], again["code"]):
+            return "hang"
+        if "Traceback" in first["said"] + again["said"]:
+            return "traceback"
+        killed = (-signal.SIGKILL,) if fault.what == KILL else ()
+        # Before a run handles signals they end it as they end any program.
+        killed += (-fault.signal,) if fault.signal else ()
+        if first["code"] not in (*PROMISED, *killed):
+            return "exit code"
+        if again["code"] != 0:
+            # A damaged config cannot be guessed: it has to be refused, in one line.
+            refused = again["code"] == 3 and again["said"].count("\n") == 1
+            return "" if fault.damage and refused else "exit code"
+        return self._differs(fault.phase, folder)
+
+    def _differs(self, phase: str, folder: Path) -> str:
+        same = contents(folder / "out") == self.wanted[phase]
+        return "" if same else "not equal"
+
+    def two_writers(self, times: int) -> Iterator[Outcome]:
+        """Starts the same command twice at once: one runs, the other is refused."""
+        fault = Fault("two writers", "explore")
+        for i in range(times):
+            folder = self._folder / f"two-{i}"
+            shutil.copytree(self.before["explore"], folder)
+            with concurrent.futures.ThreadPoolExecutor(2) as pool:
+                found = list(pool.map(lambda _: self.start(folder, fault), range(2)))  # noqa: B023
+            codes = Counter(x["code"] for x in found)
+            if codes in (Counter({0: 2}), Counter({0: 1, 3: 1})):
+                wrong = self._differs("explore", folder)
+            else:
+                wrong = "hang" if None in codes else "exit code"
+            said = "".join(x["said"] for x in found)
+            code = found[-1]["code"]
+            yield Outcome(fault, True, wrong, code, said)
+            shutil.rmtree(folder)
+
+
+class Server:
+    """A process that forks runs."""
+
+    def __init__(self, shim: Path, cache: Path) -> None:
+        shared = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+        env = {
+            "LD_PRELOAD": str(shim),
+            "PYTHONPATH": str(Path(digests.__file__).parents[2]),
+            "JAX_PLATFORMS": "cpu",
+            "JAX_COMPILATION_CACHE_DIR": shared or str(cache),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+            "MUJOCO_GL": "disable",
+            "TF_CPP_MIN_LOG_LEVEL": "2",
+        }
+        self._process = subprocess.Popen(
+            [sys.executable, str(HERE / "server.py")],
+            env=os.environ | env,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "ready\n"
+
+    def run(self, folder: Path, fault: Fault) -> dict[str, Any]:
+        """Runs a phase in a folder; what it said is added to the answer."""
+        said = Path(tempfile.mkstemp(dir=folder)[1])
+        request = {
+            "argv": [*PHASES[fault.phase], "--out", str(folder / "out")],
+            "out": str(said),
+            "root": str(folder / "out"),
+            "what": fault.what if fault.number else 0,
+            "at": fault.at,
+            "number": fault.number,
+            "listed": str(folder / "list") if fault.kind == "none" else None,
+            "signal": fault.signal,
+            "after": fault.after,
+            "limit": LIMIT,
+        }
+        assert self._process.stdin is not None and self._process.stdout is not None
+        print(json.dumps(request), file=self._process.stdin, flush=True)
+        answer = json.loads(self._process.stdout.readline())
+        return answer | {"said": said.read_text(errors="replace")}
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(30)
+
+
+def contents(out: Path) -> dict[str, str]:
+    """Returns digests of what a run's numbers are: logs, checkpoints, trajectories."""
+    found = dict(digests.found_in(out))
+    for path in out.rglob("trajectories.npz"):
+        try:
+            arrays = dict(np.load(path))
+        except Exception as error:
+            arrays = {"unreadable": np.frombuffer(str(error).encode(), np.uint8)}
+        for name, array in arrays.items():
+            key = f"{path.relative_to(out)}:{name}"
+            found[key] = hashlib.sha256(array.tobytes()).hexdigest()
+    for path in out.rglob("status.json"):
+        state = json.loads(path.read_text())["state"]
+        found[str(path.relative_to(out))] = state
+    return found
