@@ -27,9 +27,7 @@ import jaxpets
 from benchmarks import rows, workloads
 from experiments import exploration
 from experiments.build import build
-from experiments.entries import from_json
 from experiments.errors import RunError
-from experiments.presets import PRESETS
 from experiments.storage.folder import RunFolder
 from jaxpets.envs import half_cheetah
 
@@ -111,7 +109,7 @@ def _explored(
     folder: Path, search: workloads.Size
 ) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
     run = RunFolder(folder)
-    config = from_json(run.config(), PRESETS["smoke"])
+    config = exploration.config_of(run)
     num_members = config.model.num_members
     if num_members < 2 or search.num_particles % num_members:
         raise SystemExit(

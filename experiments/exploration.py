@@ -9,6 +9,19 @@ import jax
 import jaxpets
 from experiments.build import EXPLORE, Parts, State, build, trial_keys
 from experiments.config import Config
+from experiments.entries import from_json
+from experiments.presets import PRESETS
+from experiments.storage import rundir
+from experiments.storage.folder import RunFolder
+
+
+def config_of(run: RunFolder) -> Config:
+    """Returns the config that a run was started with.
+
+    Raises:
+      CheckpointError: if there is none, or one that no run can have.
+    """
+    return from_json(run.config(), PRESETS["smoke"], str(run.path / rundir.CONFIG))
 
 
 def template(config: Config, parts: Parts) -> State:

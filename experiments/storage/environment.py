@@ -71,7 +71,7 @@ def remember(path: Path, now: Mapping[str, Any]) -> list[str]:
         raise CheckpointError(f"{path} is not an object. Restore or remove it.")
     lines = compare_environment(began, now)
     if now.keys() - began.keys():
-        rundir.write_json(path, {**began, **now, **began})
+        rundir.write_json(path, {**now, **began})
     return lines
 
 

@@ -29,9 +29,8 @@ import jaxpets
 from experiments import exploration
 from experiments.build import State, build
 from experiments.config import Config
-from experiments.entries import from_json, to_json
+from experiments.entries import to_json
 from experiments.errors import RunError, UsageError
-from experiments.presets import PRESETS
 from experiments.report import tables
 from experiments.storage import metrics, rundir
 from experiments.storage.folder import RunFolder
@@ -67,10 +66,7 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     """
     if num_rows < 1:
         raise UsageError(f"--rows {num_rows} is not valid; it must be 1 or more.")
-    configs = [
-        from_json(RunFolder(run).config(), PRESETS["smoke"], str(run / rundir.CONFIG))
-        for run in runs
-    ]
+    configs = [exploration.config_of(RunFolder(run)) for run in runs]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
     # The random trials of a seed are the same in all arms: all models know them.

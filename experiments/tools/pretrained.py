@@ -18,9 +18,9 @@ import jax
 from experiments import cli, exploration
 from experiments.build import State, build
 from experiments.config import Config
-from experiments.entries import from_json, to_json
+from experiments.entries import to_json
 from experiments.errors import RunError, UsageError
-from experiments.presets import PRESETS, PRETRAINED_PLANNER
+from experiments.presets import PRETRAINED_PLANNER
 from experiments.storage import disk, metrics, rundir
 from experiments.storage.folder import RunFolder
 
@@ -41,8 +41,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     folder = cli.PRETRAINED / name
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
-    plain = RunFolder(run).config()
-    config = from_json(plain, PRESETS["smoke"], str(run / rundir.CONFIG))
+    config = exploration.config_of(RunFolder(run))
     seed = config.seeds[0] if seed is None else seed
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
@@ -66,7 +65,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
         origins[f"performed-{file}"] = evaluated.path / file
     for file, origin in origins.items():
         disk.write(folder / file, origin.read_bytes())
-    rows = metrics.read(run / rundir.METRICS, plain)
+    rows = metrics.read(run / rundir.METRICS, to_json(config))
     model.log([row.data for row in rows if row.seed == seed])
     return folder
 
