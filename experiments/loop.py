@@ -101,6 +101,7 @@ def run(
             folder.update(
                 trial=trial, num_trials=last, line=text,
                 steps_per_second=rate, seconds_left=left,
+                device_bytes=devices.bytes_in_use(),
             )  # fmt: skip
     return True
 

@@ -10,7 +10,7 @@ from experiments.errors import CheckpointError, printable
 from experiments.storage import rundir, status
 from experiments.storage.status import Status
 
-_HEADER = ("run", "state", "trial", "steps/s", "left", "last line")
+_HEADER = ("run", "state", "trial", "steps/s", "left", "memory", "last line")
 _EPILOG = """
 states:
   running      by a process of this host, or of the one that is named
@@ -58,13 +58,14 @@ def _row(run: Path) -> tuple[str, ...]:
     try:
         found = status.read(run)
     except CheckpointError as error:
-        return _cells(run, "unreadable", "", "", "", error)
+        return _cells(run, "unreadable", "", "", "", "", error)
     trial = f"{found.trial}" if found.trial is not None else ""
     trial += f"/{found.num_trials}" if found.num_trials is not None else ""
     running, rate = found.state == status.RUNNING, found.steps_per_second
     speed = f"{rate:.1f}" if running and rate is not None else ""
     left = _left(found.seconds_left) if running else ""
-    return _cells(run, found.state, trial, speed, left, _said(found))
+    memory = _memory(found) if running else ""
+    return _cells(run, found.state, trial, speed, left, memory, _said(found))
 
 
 def _cells(*values: object) -> tuple[str, ...]:
@@ -83,6 +84,12 @@ def _left(seconds: float | None) -> str:
         return ""
     minutes = seconds / 60
     return f"{minutes:.1f} min" if minutes < 60 else f"{minutes / 60:.1f} h"
+
+
+def _memory(found: Status) -> str:
+    """Returns what the host and the device hold, as in `1.2 + 3.4 GB`."""
+    held = [x for x in (found.host_bytes, found.device_bytes) if x is not None]
+    return " + ".join(f"{x / 1e9:.1f}" for x in held) + " GB" if held else ""
 
 
 def _print(rows: Sequence[Sequence[str]]) -> None:

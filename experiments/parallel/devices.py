@@ -158,6 +158,12 @@ def join(placement: Placement, tree: Any, *axes: str) -> Any:
     return jax.tree.map(one, tree)
 
 
+def bytes_in_use() -> int | None:
+    """Returns the most that the arrays take of a device of this host, if they tell."""
+    stats = [device.memory_stats() or {} for device in _devices()]
+    return max((x["bytes_in_use"] for x in stats if "bytes_in_use" in x), default=None)
+
+
 def _devices() -> list[Any]:
     """Returns the devices of this host; one if the user of jax has chosen one."""
     found = jax.local_devices()

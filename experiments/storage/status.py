@@ -41,6 +41,10 @@ class Status:
     seconds_left: float | None = None
     line: str | None = None
     """What it said last."""
+    host_bytes: int | None = None
+    """Memory that the process holds, as far as the system tells."""
+    device_bytes: int | None = None
+    """Memory of its arrays on a device, the most of any, as far as devices tell."""
     pid: int | None = None
     host: str | None = None
     process_start: int | None = None
@@ -104,7 +108,7 @@ class Writer:
             return
         try:
             if self._status.state == RUNNING:
-                changes["time"] = rundir.now()
+                changes |= {"time": rundir.now(), "host_bytes": _resident()}
                 self._status = dataclasses.replace(self._status, **changes)
                 _write(self._path, dataclasses.asdict(self._status))
         finally:
@@ -161,6 +165,15 @@ def _is_there(pid: int, started: int | None) -> bool:
     except OSError:  # it is another user's
         return True
     return True
+
+
+def _resident() -> int | None:
+    """Returns the bytes of memory that this process holds, None without a /proc."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return None
+    return pages * os.sysconf("SC_PAGESIZE")
 
 
 def _started(pid: int) -> int | None:

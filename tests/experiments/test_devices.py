@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -208,3 +209,12 @@ def test_the_benchmark_of_scaling(found):
         assert row["difference"] < 1e-4
         assert min(row[name] for name in ("one_ms", "all_ms", "efficiency")) > 0
     assert rows[1]["sizes"]["num_samples"] == 16 * rows[0]["sizes"]["num_samples"]
+
+
+def test_the_fullest_device_tells_what_arrays_take(monkeypatch):
+    said = [{"bytes_in_use": 3}, None, {"bytes_in_use": 7}, {}]
+    found = [SimpleNamespace(memory_stats=lambda x=x: x) for x in said]
+    monkeypatch.setattr(devices.jax, "local_devices", lambda: found)
+    assert devices.bytes_in_use() == 7
+    monkeypatch.setattr(devices.jax, "local_devices", lambda: found[1:2])
+    assert devices.bytes_in_use() is None

@@ -32,6 +32,7 @@ def table(capsys, *arguments):
 def test_a_run_that_runs_is_running(tmp_path):
     found = status.read(begun(tmp_path))
     assert (found.state, found.phase, found.pid) == ("running", "explore", os.getpid())
+    assert (found.host_bytes or 1e8) > 1e7  # not every system tells
 
 
 def test_a_process_that_is_gone_was_killed(tmp_path):
@@ -92,7 +93,8 @@ def test_what_is_no_status_is_named_and_replaced(tmp_path, text):
 
 def test_the_table_shows_every_run(tmp_path, capsys):
     begun(tmp_path / "on", trial=4, num_trials=9, steps_per_second=3.25,
-          seconds_left=90.0, line="explore 4/9 \x1b[31mred")  # fmt: skip
+          seconds_left=90.0, line="explore 4/9 \x1b[31mred",
+          host_bytes=520_000_000, device_bytes=3_400_000_000)  # fmt: skip
     begun(tmp_path / "away", host="h1", line="explore 1/9")
     begun(tmp_path / "broke", state="failed", reason="the disk is full", line="4/9")
     begun(tmp_path / "gone", pid=2**22, process_start=1)
@@ -107,8 +109,8 @@ def test_the_table_shows_every_run(tmp_path, capsys):
     assert code == 0 and set(rows) == {
         *("run", "on", "away", "broke", "gone", "zero-shot-004", "old", "torn")
     }  # fmt: skip
-    words = ["running", "4/9", "3.2", "1.5", "min", "explore", "4/9", r"\x1b[31mred"]
-    assert rows["on"].split()[1:] == words
+    words = "running 4/9 3.2 1.5 min 0.5 + 3.4 GB explore 4/9 \\x1b[31mred"
+    assert rows["on"].split()[1:] == words.split()
     assert "running" in rows["away"] and "on h1, " in rows["away"]
     assert "failed" in rows["broke"] and rows["broke"].endswith("the disk is full")
     assert "killed" in rows["gone"] and rows["gone"].endswith("is gone")
