@@ -115,7 +115,9 @@ def read(
 
 
 def _from_text(kind: type, value: Any) -> Any:
-    """Makes what JSON has as text."""
+    """Makes what JSON has as text; no text is none, though Path says it is `.`."""
+    if not value:
+        raise ValueError("empty")
     return kind(value)
 
 

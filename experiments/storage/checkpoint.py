@@ -163,13 +163,17 @@ def _write(
     # Orbax refuses arrays of size zero; the record has their shape.
     stored = {name: array for name, array in arrays.items() if array.size}
     items = {"state": ocp.args.StandardSave(stored), "meta": ocp.args.JsonSave(record)}
-    with _manager(
-        directory,
-        preservation_policy=policies.AnyPreservationPolicy(kept),
-        temporary_path_class=_draft_of(stored),
-        todelete_subdir=step_folders.DELETED,
-    ) as manager:
-        manager.save(step, args=ocp.args.Composite(**items), force=True)
+    try:
+        with _manager(
+            directory,
+            preservation_policy=policies.AnyPreservationPolicy(kept),
+            temporary_path_class=_draft_of(stored),
+            todelete_subdir=step_folders.DELETED,
+        ) as manager:
+            manager.save(step, args=ocp.args.Composite(**items), force=True)
+    finally:
+        # Draft, as every class, is in a cycle: it would keep them until gc finds it.
+        stored.clear()
 
 
 def _draft_of(stored: dict[str, np.ndarray]) -> type:

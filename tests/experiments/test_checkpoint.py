@@ -1,8 +1,10 @@
 """Checkpoints: what was saved comes back, or a message says why not."""
 
+import gc
 import json
 import os
 import subprocess
+import weakref
 from pathlib import Path
 
 import jax
@@ -11,7 +13,7 @@ import pytest
 from states import as_bytes, fail, make_state, restore, save_two
 
 from experiments.errors import CheckpointError, DivergedError
-from experiments.storage import checkpoint
+from experiments.storage import checkpoint, pytrees
 from experiments.storage.step_folders import SEAL
 
 
@@ -99,6 +101,25 @@ def test_keep_and_milestones(tmp_path):
     assert checkpoint.steps(tmp_path) == [7]
     with pytest.raises(ValueError, match="keep"):
         checkpoint.save(tmp_path, 8, state, {}, keep=0)
+
+
+def test_nothing_of_a_state_is_held_after_its_save(tmp_path, monkeypatch):
+    """A run would grow by a state with every trial: gc looks at old cycles rarely."""
+    seen = []
+
+    def to_host(tree):
+        arrays = {name: x.copy() for name, x in copied(tree).items()}
+        seen.extend(map(weakref.ref, arrays.values()))
+        return arrays
+
+    copied = pytrees.to_host
+    monkeypatch.setattr(pytrees, "to_host", to_host)
+    gc.disable()
+    try:
+        checkpoint.save(tmp_path, 1, make_state(1), {})
+    finally:
+        gc.enable()
+    assert seen and not any(reference() is not None for reference in seen)
 
 
 def test_going_on_from_an_older_step(directory):

@@ -59,6 +59,7 @@ def test_configs_survive_json(preset, tmp_path):
         ("model.state_margin", -1, "0.0 to 1,000,000.0 or None"),
         ("refit.bootstrap", 1, "true or false"),
         ("out", 3, "a path"),
+        ("out", "", "a path"),
         ("model", None, "an object"),
         ("planner", [], "an object"),
     ],

@@ -23,6 +23,7 @@ import numpy as np
 from experiments.tools import digests
 
 HERE = Path(__file__).parent
+ROOT = Path(digests.__file__).parents[2]  # of the code that runs
 COUNT, KILL, ONCE, FROM_THEN_ON = 1, 2, 3, 4  # as in shim.c
 LIMIT = 300.0  # seconds until a run counts as hung
 # Exit codes that are promised: done, a checkpoint's, the disk's, interrupted.
@@ -210,7 +211,7 @@ class Server:
         shared = os.environ.get("JAX_COMPILATION_CACHE_DIR")
         env = {
             "LD_PRELOAD": str(shim),
-            "PYTHONPATH": str(Path(digests.__file__).parents[2]),
+            "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}",
             "JAX_PLATFORMS": "cpu",
             "JAX_COMPILATION_CACHE_DIR": shared or str(cache),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
