@@ -1,6 +1,7 @@
 """`python -m experiments.run {explore,zero-shot,finetune,report}`: the command line."""
 
 import os
+import signal
 import sys
 import traceback
 import warnings
@@ -15,7 +16,6 @@ from experiments.cost import check_cpu, memory_advice
 from experiments.entries import differences, from_json, to_json
 from experiments.errors import (
     CheckpointError,
-    InterruptedRun,
     OutOfMemoryError,
     RunError,
     StorageError,
@@ -46,11 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config)
-    except (RunError, KeyboardInterrupt) as end:
+    except RunError as error:
         if "--debug" in arguments:
             traceback.print_exc()
-        # There may be no run yet that turns a signal into an error.
-        error = end if isinstance(end, RunError) else InterruptedRun("SIGINT")
         signals.say(last_line(error))
         return error.exit_code
     return 0
@@ -206,6 +204,10 @@ def _without_gl() -> Iterator[None]:
 
 def command() -> NoReturn:
     """Runs `main` as a program, and leaves."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # While there is no run it ends the process. Python would raise it anywhere, and
+        # jax, where it looks for a GPU, takes that for a GPU that does not work.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     code: Any = 1
     with signals.unheard():  # to the very end: threads of a failed save come last
         try:

@@ -328,15 +328,6 @@ def test_what_ends_a_run_is_a_line_and_its_status(
     assert err.partition(": ")[2].startswith(found.reason)
 
 
-def test_a_command_that_has_no_run_yet_is_stopped_in_a_line(out, capsys, monkeypatch):
-    def interrupted(argv):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "parse", interrupted)
-    assert main([*SMOKE, "--out", str(out)]) == 75
-    assert capsys.readouterr().err.startswith("stopped: SIGINT; ")
-
-
 def test_a_warning_is_one_line_without_its_source(out, capsys, monkeypatch):
     def explore(config, run):
         warnings.warn("the kernel was built anew", stacklevel=1)

@@ -31,6 +31,21 @@ STUCK = """
 """
 
 
+# What jax does where it looks for a GPU: nothing that is raised gets through.
+DEAF = """
+    import os
+    import signal
+    from experiments import cli, run
+    def parse(arguments):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except BaseException:
+            pass
+    cli.parse = parse
+    run.command()
+"""
+
+
 @pytest.fixture
 def hung_up():
     """Restores what a terminal that closes does to this process."""
@@ -51,6 +66,14 @@ def test_a_signal_stops_what_is_stoppable(name, hung_up):
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     assert signal.getsignal(number) is before
     assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_before_there_is_a_run_nothing_can_swallow_ctrl_c():
+    argv = [sys.executable, "-c", textwrap.dedent(DEAF), "explore"]
+    found = subprocess.run(
+        argv, check=False, cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGINT, "", "")
 
 
 def test_what_nohup_ignores_stays_ignored(hung_up):
