@@ -52,8 +52,12 @@ class OutOfMemoryError(RunError):
     exit_code = 6
 
 
-class InterruptedRun(RunError):
-    """A signal; the same command goes on from the last checkpoint."""
+class InterruptedRun(RunError, KeyboardInterrupt):
+    """A signal; the same command goes on from the last checkpoint.
+
+    It is a KeyboardInterrupt too, as asyncio lets that through. Orbax saves in asyncio,
+    which logs any other error of a callback, and forgets it.
+    """
 
     exit_code = 75
 

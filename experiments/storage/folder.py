@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import errors
-from experiments.errors import InterruptedRun, StorageError
+from experiments.errors import StorageError
 from experiments.parallel import distributed
 from experiments.storage import (
     checkpoint,
@@ -264,7 +264,7 @@ def _held(
         try:
             yield
         except BaseException as error:
-            stopped = isinstance(error, InterruptedRun | KeyboardInterrupt)
+            stopped = isinstance(error, KeyboardInterrupt)  # InterruptedRun is one
             with contextlib.suppress(StorageError):  # the first error says more
                 state = status.INTERRUPTED if stopped else status.FAILED
                 writer.end(state, errors.reason(error))

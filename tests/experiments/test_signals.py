@@ -1,5 +1,6 @@
 """How a run is stopped: by its first signal, in time, or else without it."""
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -81,6 +82,17 @@ def test_what_nohup_ignores_stays_ignored(hung_up):
     with signals.stoppable():
         os.kill(os.getpid(), signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+def test_a_signal_that_meets_a_callback_of_asyncio_stops_the_run(caplog):
+    async def save():
+        loop = asyncio.get_running_loop()
+        loop.call_soon(os.kill, os.getpid(), signal.SIGTERM)
+        await asyncio.sleep(60)
+
+    with pytest.raises(InterruptedRun, match="SIGTERM"), signals.stoppable():
+        asyncio.run(save())
+    assert caplog.text == ""
 
 
 def test_a_loop_stops_at_its_next_tick():
