@@ -97,7 +97,9 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
     value = np.mean([row["value"] for row in rows])
     text = "  ".join([f"value {value:.3g}", "returns:", *parts])
     bad = sum(row.get("bad_plans", 0) for row in rows)
-    return f"{text}  bad plans: {bad}" if bad else text
+    skipped = sum(row.get("fit", {}).get("num_skipped", 0) for row in rows)
+    counts = {"bad plans": bad, "updates refused": skipped}
+    return text + "".join(f"  {what}: {n}" for what, n in counts.items() if n)
 
 
 def summary(

@@ -134,8 +134,10 @@ def fitter(
     To train several seeds at once, see `jaxpets.over_seeds`, or map `step` over
     `(0, 0, 0, jaxpets.datasets.AXES)`.
 
-    An update that is not finite is dropped and counted. After every update the
-    variance bounds are put in order, see `Ensemble.project`.
+    An update whose loss or gradient is not finite is dropped and counted, and so are
+    all of an epoch that ends with weights or an optimizer that are not finite, as a
+    learning rate that is far too high leaves them. After every update the variance
+    bounds are put in order, see `Ensemble.project`.
 
     Args:
       ensemble: what to train; see there for what is read of an ensemble of your own.
@@ -213,7 +215,8 @@ def fitter(
                 done = number + i / jnp.maximum(num_batches, 1)
                 return update(progress, batch, done / config.num_epochs)
 
-            return _loop(num_batches, one, progress._replace(totals=_zeros())), None
+            progress = progress._replace(totals=_zeros())
+            return _kept(progress, _loop(num_batches, one, progress), num_batches), None
 
         start = _Progress(
             params.network, state.opt_state, jnp.zeros((), jnp.int32), _zeros()
@@ -285,6 +288,18 @@ def _loop(
 
     num_turns = (length + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
     return cast(_Progress, jax.lax.fori_loop(0, num_turns, turn, progress))
+
+
+def _kept(before: _Progress, after: _Progress, num_batches: Array) -> _Progress:
+    """Returns an epoch's end, or its start if that is where the last good weights are.
+
+    To look at all weights after every update would cost a fifth of a step on a GPU.
+    """
+    leaves = jax.tree.leaves((after.network, after.opt_state))
+    floats = [x for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
+    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats])
+    refused = before._replace(num_skipped=before.num_skipped + num_batches)
+    return _where(jnp.all(finite), after, refused)
 
 
 def _zeros() -> _Totals:

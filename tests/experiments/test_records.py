@@ -47,6 +47,11 @@ def test_plans_without_a_finite_candidate_are_counted():
     assert describe([good, bad]).endswith("  bad plans: 2")
 
 
+def test_updates_that_were_refused_are_counted():
+    rows = [row([1, 2, 3, 4]) | {"fit": {"num_skipped": n}} for n in (0, 15)]
+    assert describe(rows).endswith("back-flip 4  updates refused: 15")
+
+
 def test_a_log_of_an_older_version_has_todays_names(tmp_path):
     """The negative log-likelihood of the fit was called its loss."""
     label = {"phase": "explore", "arm": "count", "seed": 1, "trial": 2}

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,6 +107,21 @@ def test_an_update_whose_gradient_is_not_finite_is_dropped(model, params):
     for leaf in jax.tree.leaves(after.network):
         assert jnp.all(jnp.isfinite(leaf))
     assert metrics.num_skipped == metrics.num_updates
+
+
+@pytest.mark.parametrize("build", [optax.sgd, optax.adam])
+def test_an_epoch_that_ends_without_numbers_is_undone(model, params, build):
+    """A rate that is far too high: gradients are finite, and weights are not."""
+    optimizer = optax.chain(build(1e38), optax.scale(1e38))
+    fitter = jaxpets.fitter(model, optimizer, FitConfig(num_epochs=3, batch_size=8))
+    before, dataset = fitter.init(params), dataset_of(toys.transitions(40))
+    after, state, metrics = jax.jit(fitter.step)(
+        params, jax.random.key(0), before, dataset
+    )
+    chex.assert_trees_all_equal(after.network, params.network)
+    chex.assert_trees_all_equal(state, before)
+    assert metrics.num_skipped == metrics.num_updates == 15
+    assert jnp.isnan(metrics.nll) and jnp.isnan(metrics.mse)
 
 
 def test_max_logvar_never_crosses_min_logvar():
