@@ -35,6 +35,7 @@ LAYERS = {
     "_src.icem": 2,
     "_src.mppi": 2,
     "_src.rollout": 2,
+    "_src.per_state": 2,
     "_src.sharded": 2,
     "_src.rewards": 2,
     "_src.pseudo_counts": 2,
