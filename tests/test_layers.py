@@ -21,6 +21,7 @@ LAYERS = {
     "_src.checks": 0,
     "_src.moments": 1,
     "_src.elites": 1,
+    "_src.returns": 1,
     "_src.chunks": 1,
     "_src.network": 1,
     "_src.action_box": 1,
