@@ -39,6 +39,7 @@ LAYERS = {
     "_src.per_state": 2,
     "_src.sharded": 2,
     "_src.rewards": 2,
+    "_src.score": 2,
     "_src.pseudo_counts": 2,
     "_src.dataset": 2,
     "_src.check_space": 2,
