@@ -14,8 +14,8 @@ from jaxpets._src.checks import (
     check_count,
     check_flag,
     check_key,
-    check_real,
     check_record,
+    check_scalar,
 )
 from jaxpets._src.elites import select_elites
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
@@ -42,8 +42,8 @@ def cem(
     num_samples: int = 500,
     num_elites: int = 50,
     num_iterations: int = 5,
-    momentum: float = 0.1,
-    min_variance: float = 1e-3,
+    momentum: float | Array = 0.1,
+    min_variance: float | Array = 1e-3,
     legacy_variance: bool = False,
     unroll: bool = False,
 ) -> TrajectoryOptimizer:
@@ -63,9 +63,9 @@ def cem(
       num_samples: N.
       num_elites: how many of the best samples shape the next iteration.
       num_iterations: iterations per call.
-      momentum: share of the old mean and variance that is kept.
+      momentum: share of the old mean and variance that is kept; may be traced.
       min_variance: the search freezes once no variance exceeds this, in units of a
-        box scaled to `[-1, 1]`.
+        box scaled to `[-1, 1]`; may be traced.
       legacy_variance: take the elites' variance without momentum, as the first
         public PETS code did by mistake until November 2018.
       unroll: compile the iterations one after the other and not as a loop. The search
@@ -92,8 +92,8 @@ def cem(
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
-    check_real("momentum", momentum, 0.0, 1.0)
-    check_real("min_variance", min_variance, 0.0)
+    check_scalar("momentum", momentum, 0.0, 1.0)
+    check_scalar("min_variance", min_variance, 0.0)
     check_flag("legacy_variance", legacy_variance)
     check_flag("unroll", unroll)
     shape = (horizon, box.center.shape[0])

@@ -15,6 +15,7 @@ from jaxpets._src.checks import (
     check_key,
     check_real,
     check_record,
+    check_scalar,
 )
 from jaxpets._src.elites import select_elites
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
@@ -40,9 +41,9 @@ def icem(
     num_samples: int = 64,
     num_elites: int = 10,
     num_iterations: int = 3,
-    momentum: float = 0.1,
-    noise_beta: float = 2.0,
-    init_std: float = 0.5,
+    momentum: float | Array = 0.1,
+    noise_beta: float | Array = 2.0,
+    init_std: float | Array = 0.5,
     kept_fraction: float = 0.3,
     decay: float = 1.25,
     execute_best: bool = False,
@@ -61,10 +62,11 @@ def icem(
       num_samples: N of the first iteration.
       num_elites: how many of the best samples shape the next iteration.
       num_iterations: iterations per call.
-      momentum: share of the old mean and standard deviation that is kept.
-      noise_beta: 0 is white noise, 2 a random walk.
+      momentum: share of the old mean and standard deviation that is kept; may
+        be traced.
+      noise_beta: 0 is white noise, 2 a random walk; may be traced.
       init_std: standard deviation at the start of a call, in units of a box scaled to
-        `[-1, 1]`.
+        `[-1, 1]`; may be traced.
       kept_fraction: share of the elites that is kept.
       decay: shrinking factor of the population.
       execute_best: return the best sequence seen in the last iteration, as in the
@@ -81,9 +83,9 @@ def icem(
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
-    check_real("momentum", momentum, 0.0, 1.0)
-    check_real("noise_beta", noise_beta, 0.0)
-    check_real("init_std", init_std, 1e-6)
+    check_scalar("momentum", momentum, 0.0, 1.0)
+    check_scalar("noise_beta", noise_beta, 0.0)
+    check_scalar("init_std", init_std, 1e-6)
     check_real("kept_fraction", kept_fraction, 0.0, 1.0)
     check_real("decay", decay, 1.0)
     check_flag("execute_best", execute_best)
@@ -133,7 +135,7 @@ def icem(
     return TrajectoryOptimizer(init, step)
 
 
-def _colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
+def _colored_noise(key: Array, beta: float | Array, shape: tuple[int, ...]) -> Array:
     """Draws Gaussian noise of unit variance, correlated along axis -2 (time).
 
     The power of frequency f is proportional to `1 / f^beta`; entries of the last axis

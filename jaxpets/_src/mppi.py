@@ -12,8 +12,8 @@ from jaxpets._src.checks import (
     check_array,
     check_count,
     check_key,
-    check_real,
     check_record,
+    check_scalar,
 )
 from jaxpets._src.elites import is_valid
 from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
@@ -36,8 +36,8 @@ def mppi(
     action_high: ArrayLike,
     num_samples: int = 500,
     num_iterations: int = 1,
-    std: float = 0.5,
-    temperature: float = 1.0,
+    std: float | Array = 0.5,
+    temperature: float | Array = 1.0,
 ) -> TrajectoryOptimizer:
     """Builds MPPI (Williams et al., 2017).
 
@@ -51,8 +51,9 @@ def mppi(
       action_high: `[A]`.
       num_samples: N.
       num_iterations: iterations per call.
-      std: of the noise, in units of a box scaled to `[-1, 1]`.
-      temperature: 0.1 follows the best few samples, 10 averages over all.
+      std: of the noise, in units of a box scaled to `[-1, 1]`; may be traced.
+      temperature: 0.1 follows the best few samples, 10 averages over all; may be
+        traced.
 
     Returns:
       A TrajectoryOptimizer; its Solution's value is the weighted mean of the last
@@ -65,8 +66,8 @@ def mppi(
     box = action_box(action_low, action_high)
     check_count("num_samples", num_samples, minimum=2)
     check_count("num_iterations", num_iterations)
-    check_real("std", std, 1e-6)
-    check_real("temperature", temperature, 1e-6)
+    check_scalar("std", std, 1e-6)
+    check_scalar("temperature", temperature, 1e-6)
     scale = std * box.half_width
     shape = (horizon, box.center.shape[0])
 

@@ -37,7 +37,7 @@ def plan(
     *,
     chunk_size: int | None = None,
     terminal_fn: Callable[[Any, Array], Array] | None = None,
-    discount: ArrayLike = 1.0,
+    discount: float | Array = 1.0,
     risk_fn: Callable[[Array], Array] | None = None,
 ) -> Planner:
     """Builds a model-predictive controller.

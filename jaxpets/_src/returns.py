@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
 from jaxpets._src.checks import check_array, check_callable, check_scalar
 from jaxpets._src.types import RewardFn
@@ -40,7 +39,7 @@ def checked_reward(reward_fn: RewardFn) -> RewardFn:
 def candidate_returns(
     reward_fn: RewardFn,
     terminal_fn: Callable[[Any, Array], Array] | None,
-    discount: ArrayLike,
+    discount: float | Array,
     risk_fn: Callable[[Array], Array] | None,
 ) -> ReturnsFn:
     """Builds the values of candidates from their paths; see `plan` for the arguments.
