@@ -33,6 +33,16 @@ class ICEMState(NamedTuple):
     elites: Array
 
 
+class _Found(NamedTuple):
+    """What an iteration leaves to the next one; `kept` `[K, H, A]`, `value` `[]`."""
+
+    mean: Array
+    std: Array
+    kept: Array
+    best: Array
+    value: Array
+
+
 def icem(
     *,
     horizon: int,
@@ -47,6 +57,7 @@ def icem(
     kept_fraction: float = 0.3,
     decay: float = 1.25,
     execute_best: bool = False,
+    unroll: bool = True,
 ) -> TrajectoryOptimizer:
     """Builds iCEM (Pinneri et al., 2020).
 
@@ -71,6 +82,11 @@ def icem(
       decay: shrinking factor of the population.
       execute_best: return the best sequence seen in the last iteration, as in the
         paper of iCEM, and not the mean, which is less prone to a model's errors.
+      unroll: compile the iterations one after the other, each with its population.
+        False compiles them as one loop, in about the time of one iteration. The same
+        sequences are tried, but all iterations imagine as many as the first and the
+        mean, and leave the surplus out: it takes longer to run, the more the steeper
+        the decay, and a model's noise is another draw.
 
     Returns:
       A TrajectoryOptimizer.
@@ -89,6 +105,7 @@ def icem(
     check_real("kept_fraction", kept_fraction, 0.0, 1.0)
     check_real("decay", decay, 1.0)
     check_flag("execute_best", execute_best)
+    check_flag("unroll", unroll)
     shape = (horizon, box.center.shape[0])
     num_kept = round(kept_fraction * num_elites)
     smallest = min(num_samples, 2 * num_elites)
@@ -101,6 +118,48 @@ def icem(
         # No sequence was found yet: the middle of the box stands in.
         return ICEMState(mean, jnp.broadcast_to(mean, (num_kept, *shape)))
 
+    def evaluate(
+        objective_fn: ObjectiveFn,
+        keys: Array,
+        found: _Found,
+        population: int,
+        with_mean: bool,
+    ) -> tuple[Array, Array]:
+        sample_key, value_key = keys
+        noise = _colored_noise(sample_key, noise_beta, (population, *shape))
+        actions = box.clip(found.mean + found.std * noise)
+        candidates = [actions, found.kept]
+        if with_mean:
+            candidates.append(found.mean[None])
+        actions = jnp.concatenate(candidates)
+        values = objective_fn(value_key, actions)
+        check_array("objective_fn's result", values, [actions.shape[0]])
+        return actions, values
+
+    def improve(found: _Found, actions: Array, values: Array) -> _Found:
+        elites = select_elites(values, actions, num_elites)
+        mean = box.clip(momentum * found.mean + (1 - momentum) * elites.mean)
+        std = momentum * found.std + (1 - momentum) * jnp.sqrt(elites.variance)
+        kept, best = elites.actions[:num_kept], elites.actions[0]
+        return _Found(mean, std, kept, best, elites.value)
+
+    def loop(objective_fn: ObjectiveFn, keys: Array, found: _Found) -> _Found:
+        row = jnp.arange(num_samples + num_kept + 1)
+
+        def iterate(found: _Found, inputs: tuple[Array, ...]) -> tuple[_Found, None]:
+            keys, population, is_last = inputs
+            actions, values = evaluate(objective_fn, keys, found, num_samples, True)
+            is_surplus = (row >= population) & (row < num_samples)
+            is_surplus |= (row == row[-1]) & ~is_last
+            # Below the worst value: there are always enough others to be elites.
+            return improve(
+                found, actions, jnp.where(is_surplus, -jnp.inf, values)
+            ), None
+
+        is_last = jnp.arange(num_iterations) == num_iterations - 1
+        inputs = (keys, jnp.array(populations, jnp.int32), is_last)
+        return jax.lax.scan(iterate, found, inputs)[0]
+
     def step(
         objective_fn: ObjectiveFn, key: Array, state: ICEMState
     ) -> tuple[Solution, ICEMState]:
@@ -110,27 +169,18 @@ def icem(
         check_array("state.mean", mean, shape)
         check_array("state.elites", kept, [num_kept, *shape])
         std = jnp.broadcast_to(init_std * box.half_width, shape)
+        found = _Found(mean, std, kept, mean, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
-        best = value = None
-        # A Python loop, because the population, a shape, shrinks.
-        for i, population in enumerate(populations):
-            sample_key, value_key = keys[i]
-            noise = _colored_noise(sample_key, noise_beta, (population, *shape))
-            actions = box.clip(mean + std * noise)
-            candidates = [actions, kept]
-            if i == num_iterations - 1:
-                candidates.append(mean[None])
-            actions = jnp.concatenate(candidates)
-            values = objective_fn(value_key, actions)
-            check_array("objective_fn's result", values, [actions.shape[0]])
-            elites = select_elites(values, actions, num_elites)
-            mean = box.clip(momentum * mean + (1 - momentum) * elites.mean)
-            std = momentum * std + (1 - momentum) * jnp.sqrt(elites.variance)
-            kept, best = elites.actions[:num_kept], elites.actions[0]
-            value = elites.value
-        assert best is not None and value is not None
-        solution = Solution(actions=best if execute_best else mean, value=value)
-        return solution, ICEMState(box.shift(mean), box.shift(kept))
+        if unroll:
+            for i, population in enumerate(populations):
+                is_last = i == num_iterations - 1
+                tried = evaluate(objective_fn, keys[i], found, population, is_last)
+                found = improve(found, *tried)
+        else:
+            found = loop(objective_fn, keys, found)
+        best = found.best if execute_best else found.mean
+        state = ICEMState(box.shift(found.mean), box.shift(found.kept))
+        return Solution(actions=best, value=found.value), state
 
     return TrajectoryOptimizer(init, step)
 
