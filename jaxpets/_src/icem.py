@@ -1,6 +1,6 @@
 """iCEM: a cross-entropy method for small budgets."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,13 @@ from jaxpets._src.checks import (
     check_record,
     check_scalar,
 )
-from jaxpets._src.elites import select_elites
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.elites import join_iterations, select_elites
+from jaxpets._src.types import (
+    Candidates,
+    ObjectiveFn,
+    Solution,
+    TrajectoryOptimizer,
+)
 
 
 class ICEMState(NamedTuple):
@@ -58,6 +63,7 @@ def icem(
     decay: float = 1.25,
     execute_best: bool = False,
     unroll: bool = True,
+    keep_candidates: bool = False,
 ) -> TrajectoryOptimizer:
     """Builds iCEM (Pinneri et al., 2020).
 
@@ -87,6 +93,8 @@ def icem(
         sequences are tried, but all iterations imagine as many as the first and the
         mean, and leave the surplus out: it takes longer to run, the more the steeper
         the decay, and a model's noise is another draw.
+      keep_candidates: return all sequences that were tried, with their values, in
+        `Solution.candidates`; for drawing them.
 
     Returns:
       A TrajectoryOptimizer.
@@ -99,13 +107,8 @@ def icem(
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
-    check_scalar("momentum", momentum, 0.0, 1.0)
-    check_scalar("noise_beta", noise_beta, 0.0)
-    check_scalar("init_std", init_std, 1e-6)
-    check_real("kept_fraction", kept_fraction, 0.0, 1.0)
-    check_real("decay", decay, 1.0)
-    check_flag("execute_best", execute_best)
-    check_flag("unroll", unroll)
+    _check_numbers(momentum, noise_beta, init_std, kept_fraction, decay)
+    _check_flags(execute_best, unroll, keep_candidates)
     shape = (horizon, box.center.shape[0])
     num_kept = round(kept_fraction * num_elites)
     smallest = min(num_samples, 2 * num_elites)
@@ -124,7 +127,7 @@ def icem(
         found: _Found,
         population: int,
         with_mean: bool,
-    ) -> tuple[Array, Array]:
+    ) -> Candidates:
         sample_key, value_key = keys
         noise = _colored_noise(sample_key, noise_beta, (population, *shape))
         actions = box.clip(found.mean + found.std * noise)
@@ -134,7 +137,7 @@ def icem(
         actions = jnp.concatenate(candidates)
         values = objective_fn(value_key, actions)
         check_array("objective_fn's result", values, [actions.shape[0]])
-        return actions, values
+        return Candidates(actions, values)
 
     def improve(found: _Found, actions: Array, values: Array) -> _Found:
         elites = select_elites(values, actions, num_elites)
@@ -143,22 +146,26 @@ def icem(
         kept, best = elites.actions[:num_kept], elites.actions[0]
         return _Found(mean, std, kept, best, elites.value)
 
-    def loop(objective_fn: ObjectiveFn, keys: Array, found: _Found) -> _Found:
+    def loop(
+        objective_fn: ObjectiveFn, keys: Array, found: _Found
+    ) -> tuple[_Found, Any]:
         row = jnp.arange(num_samples + num_kept + 1)
 
-        def iterate(found: _Found, inputs: tuple[Array, ...]) -> tuple[_Found, None]:
+        def iterate(found: _Found, inputs: tuple[Array, ...]) -> tuple[_Found, Any]:
             keys, population, is_last = inputs
-            actions, values = evaluate(objective_fn, keys, found, num_samples, True)
+            tried = evaluate(objective_fn, keys, found, num_samples, True)
             is_surplus = (row >= population) & (row < num_samples)
             is_surplus |= (row == row[-1]) & ~is_last
             # Below the worst value: there are always enough others to be elites.
+            values = jnp.where(is_surplus, -jnp.inf, tried.values)
             return improve(
-                found, actions, jnp.where(is_surplus, -jnp.inf, values)
-            ), None
+                found, tried.actions, values
+            ), tried if keep_candidates else ()
 
         is_last = jnp.arange(num_iterations) == num_iterations - 1
         inputs = (keys, jnp.array(populations, jnp.int32), is_last)
-        return jax.lax.scan(iterate, found, inputs)[0]
+        found, tried = jax.lax.scan(iterate, found, inputs)
+        return found, join_iterations(tried)
 
     def step(
         objective_fn: ObjectiveFn, key: Array, state: ICEMState
@@ -172,17 +179,40 @@ def icem(
         found = _Found(mean, std, kept, mean, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
         if unroll:
+            every: list[Any] = []
             for i, population in enumerate(populations):
                 is_last = i == num_iterations - 1
                 tried = evaluate(objective_fn, keys[i], found, population, is_last)
                 found = improve(found, *tried)
+                every.append(tried if keep_candidates else ())
+            tried = jax.tree.map(lambda *parts: jnp.concatenate(parts), *every)
         else:
-            found = loop(objective_fn, keys, found)
+            found, tried = loop(objective_fn, keys, found)
         best = found.best if execute_best else found.mean
         state = ICEMState(box.shift(found.mean), box.shift(found.kept))
-        return Solution(actions=best, value=found.value), state
+        return Solution(best, found.value, tried), state
 
     return TrajectoryOptimizer(init, step)
+
+
+def _check_numbers(
+    momentum: float | Array,
+    noise_beta: float | Array,
+    init_std: float | Array,
+    kept_fraction: float,
+    decay: float,
+) -> None:
+    check_scalar("momentum", momentum, 0.0, 1.0)
+    check_scalar("noise_beta", noise_beta, 0.0)
+    check_scalar("init_std", init_std, 1e-6)
+    check_real("kept_fraction", kept_fraction, 0.0, 1.0)
+    check_real("decay", decay, 1.0)
+
+
+def _check_flags(execute_best: bool, unroll: bool, keep_candidates: bool) -> None:
+    check_flag("execute_best", execute_best)
+    check_flag("unroll", unroll)
+    check_flag("keep_candidates", keep_candidates)
 
 
 def _colored_noise(key: Array, beta: float | Array, shape: tuple[int, ...]) -> Array:

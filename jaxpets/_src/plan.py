@@ -122,7 +122,7 @@ def plan(
 
         whole = objective if chunk_size is None else chunked(objective, chunk_size)
         solution, state = optimizer.step(whole, key, state)
-        return PlanOutput(solution.actions[0], solution.actions, solution.value), state
+        return PlanOutput(solution.actions[0], *solution), state
 
     return Planner(optimizer.init, step)
 
