@@ -14,6 +14,7 @@ from jaxpets._src.rewards import (
     one_step_disagreement,
     pessimistic,
 )
+from jaxpets._src.score import score
 
 __all__ = [
     "PseudoCounts",
@@ -25,5 +26,6 @@ __all__ = [
     "one_step_disagreement",
     "pessimistic",
     "pseudo_count",
+    "score",
     "simhash",
 ]

@@ -49,16 +49,30 @@ class PlanParams(NamedTuple):
     reward: Any = ()
 
 
+class Candidates(NamedTuple):
+    """The M sequences that a search tried in one call, iteration after iteration.
+
+    Attributes:
+      actions: `[M, H, A]`.
+      values: `[M]`, what the objective answered.
+    """
+
+    actions: Array
+    values: Array
+
+
 class Solution(NamedTuple):
     """What a trajectory optimizer found.
 
     Attributes:
       actions: `[H, A]`.
       value: `[]`, the mean value of the last elites.
+      candidates: all that was tried, if the search keeps it; else ().
     """
 
     actions: Array
     value: Array
+    candidates: Candidates | tuple[()] = ()
 
 
 class PlanOutput(NamedTuple):
@@ -69,11 +83,14 @@ class PlanOutput(NamedTuple):
       actions: `[H, A]`, the whole plan.
       value: `[]`, the return under the model, summed over the horizon: the mean over
         the last elites, in the reward's unit.
+      candidates: all that was tried, if the search keeps it; else (). Their paths are
+        one call of the rollout.
     """
 
     action: Array
     actions: Array
     value: Array
+    candidates: Candidates | tuple[()] = ()
 
 
 class EnvState(NamedTuple):

@@ -108,6 +108,11 @@ def mixture(params, obs, action, next_obs):
     return toys.reach(params[0], *step) + 0.1 * novelty
 
 
+def jittered(gain, key, obs, action):
+    noise = jax.random.normal(key, obs.shape, jnp.float32)
+    return toys.cart(gain, None, obs, action) + 0.01 * noise
+
+
 CASES = {
     **{f"plan-{n}": functools.partial(planner_case, n) for n in toys.OPTIMIZERS},
     "random_planner": lambda: planner_case("random"),
@@ -117,6 +122,10 @@ CASES = {
     ),
     "particle_rollout-ensemble": lambda: Case(
         LEARNED, lambda i: (model(i), key_of(i), cart_obs(i), actions(i))
+    ),
+    "per_state": lambda: Case(
+        jaxpets.per_state(jittered),
+        lambda i: (jnp.float32(1 + i), key_of(i), particles(i), actions(i)[0]),
     ),
     "env_rollout": lambda: Case(
         env_rollout(ENV), lambda i: ((), key_of(i), ENV.reset(key_of(i)), actions(i))
@@ -148,4 +157,4 @@ CASES = {
     ),
 }
 STATEFUL = [name for name in CASES if "plan" in name or name in toys.OPTIMIZERS]
-KEYED = [*STATEFUL, "particle_rollout", "particle_rollout-ensemble"]
+KEYED = [*STATEFUL, "particle_rollout", "particle_rollout-ensemble", "per_state"]

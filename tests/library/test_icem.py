@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from toys import bumpy, record
+from toys import assert_trees_close, bumpy, record
 
 import jaxpets
 from jaxpets._src.icem import _colored_noise
@@ -115,6 +115,22 @@ def test_population_shrinks_to_twice_the_elites():
     want = [size + kept for size in fresh]
     want[-1] += 1  # the mean itself
     assert sizes == want
+
+
+@pytest.mark.parametrize("num_iterations", [1, 5])
+@pytest.mark.parametrize("execute_best", [True, False])
+def test_a_loop_is_the_same_search(num_iterations, execute_best):
+    settings = dict(decay=1.6, num_iterations=num_iterations, execute_best=execute_best)
+    want = record(search(**settings), bumpy)
+    got = record(search(unroll=False, **settings), bumpy)
+    assert [len(actions) for actions in got.actions] == num_iterations * [60 + 4 + 1]
+    pairs = zip(want.actions, got.actions, strict=True)
+    for i, (few, many) in enumerate(pairs, start=1):
+        num_fresh = len(few) - 4 - (i == num_iterations)
+        np.testing.assert_allclose(many[:num_fresh], few[:num_fresh], atol=1e-5)
+    # A loop rounds otherwise; elites are the same.
+    assert_trees_close(got.solution, want.solution, rtol=1e-4, atol=1e-5)
+    assert_trees_close(got.state, want.state, rtol=1e-4, atol=1e-5)
 
 
 def test_elites_are_kept_within_a_call():
