@@ -1,6 +1,7 @@
 """Exploration rewards, plain functions for `jaxpets.plan`, and their data."""
 
 from jaxpets._src.ensemble_params import max_variance
+from jaxpets._src.one_step import jensen_renyi, one_step_disagreement, opax
 from jaxpets._src.pseudo_counts import (
     PseudoCounts,
     count_states,
@@ -9,20 +10,27 @@ from jaxpets._src.pseudo_counts import (
     simhash,
 )
 from jaxpets._src.rewards import (
+    MixtureData,
+    ensemble_std,
     epistemic,
     information_gain,
-    one_step_disagreement,
+    mixture,
     pessimistic,
 )
 
 __all__ = [
+    "MixtureData",
     "PseudoCounts",
     "count_states",
+    "ensemble_std",
     "epistemic",
     "information_gain",
+    "jensen_renyi",
     "lookup",
     "max_variance",
+    "mixture",
     "one_step_disagreement",
+    "opax",
     "pessimistic",
     "pseudo_count",
     "simhash",

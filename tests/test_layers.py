@@ -37,6 +37,7 @@ LAYERS = {
     "_src.rollout": 2,
     "_src.sharded": 2,
     "_src.rewards": 2,
+    "_src.one_step": 3,
     "_src.pseudo_counts": 2,
     "_src.dataset": 2,
     "_src.check_space": 2,

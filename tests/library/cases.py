@@ -94,18 +94,17 @@ def step_of(i, size=2, action_size=1):
     return particles(i, size), action, particles(i + 3, size)
 
 
+def mixed(i):
+    weight = jnp.float32(0.1 * i)
+    return jaxpets.rewards.MixtureData(jnp.float32(i), jnp.ones(2), weight)
+
+
 def counts(i):
     projection = jaxpets.rewards.simhash(jax.random.key(5), 8, 2)
     rows = particles(i).reshape(12, 2)
     data = jaxpets.Transition(rows, rows[:, :1], rows)
     dataset = jaxpets.datasets.append(jaxpets.datasets.init(16, 2, 1), data)
     return jaxpets.rewards.count_states(projection, dataset)
-
-
-def mixture(params, obs, action, next_obs):
-    step = (obs, action, next_obs)
-    novelty = jaxpets.rewards.epistemic(params[1], *step)
-    return toys.reach(params[0], *step) + 0.1 * novelty
 
 
 CASES = {
@@ -143,8 +142,18 @@ CASES = {
         lambda i: (jax.tree.map(lambda x: x[i], hc.tasks()), *step_of(i, 18, 6)),
     ),
     "user-reward": lambda: Case(toys.reach, lambda i: (jnp.float32(i), *step_of(i))),
+    "ensemble_std": lambda: Case(
+        jaxpets.rewards.ensemble_std, lambda i: ((), *step_of(i))
+    ),
+    "opax": lambda: Case(
+        jaxpets.rewards.opax(MODEL.predict), lambda i: (model(i), *step_of(i))
+    ),
+    "jensen_renyi": lambda: Case(
+        jaxpets.rewards.jensen_renyi(MODEL.predict), lambda i: (model(i), *step_of(i))
+    ),
     "mixture": lambda: Case(
-        mixture, lambda i: ((jnp.float32(i), jnp.ones(2)), *step_of(i))
+        jaxpets.rewards.mixture(toys.reach, jaxpets.rewards.epistemic),
+        lambda i: (mixed(i), *step_of(i)),
     ),
 }
 STATEFUL = [name for name in CASES if "plan" in name or name in toys.OPTIMIZERS]
