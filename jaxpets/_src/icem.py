@@ -113,7 +113,7 @@ def icem(
         # A Python loop, because the population, a shape, shrinks.
         for i, population in enumerate(populations):
             sample_key, value_key = keys[i]
-            noise = _colored_noise(sample_key, noise_beta, (population, *shape))
+            noise = colored_noise(sample_key, noise_beta, (population, *shape))
             actions = box.clip(mean + std * noise)
             candidates = [actions, kept]
             if i == num_iterations - 1:
@@ -133,7 +133,7 @@ def icem(
     return TrajectoryOptimizer(init, step)
 
 
-def _colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
+def colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
     """Draws Gaussian noise of unit variance, correlated along axis -2 (time).
 
     The power of frequency f is proportional to `1 / f^beta`; entries of the last axis
