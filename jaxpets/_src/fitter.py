@@ -24,6 +24,7 @@ from jaxpets._src.types import Dataset
 
 # Updates between two looks at how many there are: a GPU's host waits for each.
 _UPDATES_AT_ONCE = 4
+Optimizer = optax.GradientTransformation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,9 +120,7 @@ class _Progress(NamedTuple):
     totals: _Totals  # of this epoch
 
 
-def fitter(
-    ensemble: Ensemble, optimizer: optax.GradientTransformation, config: FitConfig
-) -> Fitter:
+def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitter:
     """Builds the trainer of PETS.
 
     One call refits the scaler on all data, draws a bootstrap per member (as many rows
@@ -152,7 +151,7 @@ def fitter(
     """
     check_record("ensemble", ensemble, Ensemble)
     check_record("config", config, FitConfig)
-    _check_optimizer(optimizer)
+    check_optimizer(optimizer)
     check_params = params_check(ensemble.init)
 
     def init(params: EnsembleParams) -> FitState:
@@ -235,7 +234,8 @@ def fitter(
     return Fitter(init, step)
 
 
-def _check_optimizer(optimizer: Any) -> None:
+def check_optimizer(optimizer: Any) -> None:
+    """Raises unless `optimizer` is one of optax."""
     if not isinstance(optimizer, optax.GradientTransformation):
         kind = type(optimizer).__name__
         raise TypeError(

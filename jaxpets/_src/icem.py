@@ -129,7 +129,7 @@ def icem(
         with_mean: bool,
     ) -> Candidates:
         sample_key, value_key = keys
-        noise = _colored_noise(sample_key, noise_beta, (population, *shape))
+        noise = colored_noise(sample_key, noise_beta, (population, *shape))
         actions = box.clip(found.mean + found.std * noise)
         candidates = [actions, found.kept]
         if with_mean:
@@ -215,7 +215,7 @@ def _check_flags(execute_best: bool, unroll: bool, keep_candidates: bool) -> Non
     check_flag("keep_candidates", keep_candidates)
 
 
-def _colored_noise(key: Array, beta: float | Array, shape: tuple[int, ...]) -> Array:
+def colored_noise(key: Array, beta: float | Array, shape: tuple[int, ...]) -> Array:
     """Draws Gaussian noise of unit variance, correlated along axis -2 (time).
 
     The power of frequency f is proportional to `1 / f^beta`; entries of the last axis

@@ -4,12 +4,9 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
-from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
     check_callable,
     check_count,
@@ -132,32 +129,3 @@ def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], 
     if isinstance(rollout_fn, ModelRolloutFn):
         return rollout_fn.bind(params)
     return functools.partial(rollout_fn, params)
-
-
-def random_planner(action_low: ArrayLike, action_high: ArrayLike) -> Planner:
-    """Builds a planner that draws every action uniformly from the box.
-
-    The random arm of the paper, and the first trial of every other arm.
-
-    Args:
-      action_low: `[A]`.
-      action_high: `[A]`.
-
-    Returns:
-      A Planner with an empty state; its plans have length one and value zero.
-
-    Raises:
-      TypeError, ValueError: if the box is not finite or empty.
-    """
-    box = action_box(action_low, action_high)
-
-    def step(
-        params: PlanParams, key: Array, state: tuple[()], obs: Any
-    ) -> tuple[PlanOutput, tuple[()]]:
-        del params, obs
-        check_key("key", key)
-        uniform = jax.random.uniform(key, box.low.shape, jnp.float32)
-        action = box.low + (box.high - box.low) * uniform
-        return PlanOutput(action, action[None], jnp.zeros((), jnp.float32)), state
-
-    return Planner(tuple, step)

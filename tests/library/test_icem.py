@@ -6,7 +6,7 @@ import reference
 from toys import assert_trees_close, bumpy, record
 
 import jaxpets
-from jaxpets._src.icem import _colored_noise
+from jaxpets._src.icem import colored_noise
 
 ONE = jnp.ones(2)
 
@@ -49,7 +49,7 @@ def test_few_left_of_many_rejected_make_the_plan(execute_best):
 
 @pytest.mark.parametrize("beta", [0.0, 1.0, 2.0, 3.0])
 def test_noise_has_its_colour(beta):
-    noise = _colored_noise(jax.random.key(1), beta, (2000, 64, 2))
+    noise = colored_noise(jax.random.key(1), beta, (2000, 64, 2))
     slope = reference.spectrum_slope(np.asarray(noise).swapaxes(1, 2))
     # 4000 series: the mean power of a frequency is known to 2 %.
     np.testing.assert_allclose(slope, -beta, atol=0.05)
@@ -58,7 +58,7 @@ def test_noise_has_its_colour(beta):
 @pytest.mark.parametrize("horizon", [1, 2, 15, 30])
 @pytest.mark.parametrize("beta", [0.0, 2.0])
 def test_noise_has_unit_variance_at_every_step(horizon, beta):
-    noise = _colored_noise(jax.random.key(2), beta, (20_000, horizon, 1))
+    noise = colored_noise(jax.random.key(2), beta, (20_000, horizon, 1))
     assert noise.shape == (20_000, horizon, 1) and noise.dtype == jnp.float32
     # The variance of 20,000 draws has a deviation of 1 %.
     np.testing.assert_allclose(np.var(noise, axis=0), 1.0, atol=0.05)
@@ -66,12 +66,12 @@ def test_noise_has_unit_variance_at_every_step(horizon, beta):
 
 
 def test_steep_noise_keeps_its_variance():
-    noise = _colored_noise(jax.random.key(3), 30.0, (4000, 30, 1))
+    noise = colored_noise(jax.random.key(3), 30.0, (4000, 30, 1))
     np.testing.assert_allclose(np.var(noise), 1.0, atol=0.1)
 
 
 def test_noise_is_independent_across_actions_and_samples():
-    noise = np.asarray(_colored_noise(jax.random.key(4), 2.0, (8000, 10, 3)))
+    noise = np.asarray(colored_noise(jax.random.key(4), 2.0, (8000, 10, 3)))
     for step in (0, 5):
         correlation = np.corrcoef(noise[:, step].T)
         # The deviation of a correlation of 8000 pairs is 0.011.
@@ -82,7 +82,7 @@ def test_noise_is_independent_across_actions_and_samples():
 
 def test_red_noise_is_smoother_than_white():
     def roughness(beta):
-        noise = _colored_noise(jax.random.key(5), beta, (500, 30, 1))
+        noise = colored_noise(jax.random.key(5), beta, (500, 30, 1))
         return float(jnp.mean(jnp.diff(noise, axis=1) ** 2))
 
     assert roughness(2.0) < 0.3 * roughness(0.0)
