@@ -6,6 +6,7 @@ from jaxpets._src.fitter import FitMetrics, FitState, Fitter
 from jaxpets._src.fused_rollout import FusedRollout
 from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput
 from jaxpets._src.types import (
+    Coordinate,
     Dataset,
     DynamicsFn,
     Env,
@@ -25,6 +26,7 @@ from jaxpets._src.types import (
 from jaxpets._src.unroll import UnrollState
 
 __all__ = [
+    "Coordinate",
     "Dataset",
     "DynamicsFn",
     "Ensemble",

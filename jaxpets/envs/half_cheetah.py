@@ -17,9 +17,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_key, check_record
+from jaxpets._src.coordinates import space
 from jaxpets._src.types import Env, EnvState, ModelSpace
 from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.native import native_physics
+from jaxpets.envs.observations import DEFAULT, readings
 
 with needs_extra():
     import mujoco
@@ -128,33 +130,13 @@ def task_reward(
 def model_space() -> ModelSpace:
     """Returns the coordinates of PETS for this observation.
 
-    Features drop the finite-difference velocity and show the pitch as sine and
-    cosine: `[F] = 18`. Targets are changes, but for that velocity, which is predicted
-    itself. Imagined states are bounded except for the pitch, which grows by a turn a
-    second in a flip.
+    They follow from the joints, as those of any robot. Features drop the
+    finite-difference velocity and show the pitch as sine and cosine: `[F] = 18`.
+    Targets are changes, but for that velocity, which is predicted itself. Imagined
+    states are bounded except for the pitch, which grows by a turn a second in a flip.
     """
-
-    def features(obs: Array) -> Array:
-        pitch = obs[..., PITCH, None]
-        rest = obs[..., PITCH + 1 :]
-        parts = [obs[..., HEIGHT, None], jnp.sin(pitch), jnp.cos(pitch), rest]
-        return jnp.concatenate(parts, axis=-1)
-
-    # What the targets are relative to: everything but the velocity.
-    relative = jnp.ones((OBS_SIZE,), jnp.float32).at[FORWARD_VELOCITY].set(0.0)
-    bounded = jnp.arange(OBS_SIZE) != PITCH
-
-    def bound(obs: Array, low: Array, high: Array) -> Array:
-        low = jnp.where(bounded, low, -jnp.inf)
-        return jnp.clip(obs, low, jnp.where(bounded, high, jnp.inf))
-
-    def target(obs: Array, next_obs: Array) -> Array:
-        return next_obs - relative * obs
-
-    def next_obs(obs: Array, target: Array) -> Array:
-        return relative * obs + target
-
-    return ModelSpace(features, target, next_obs, bound)
+    found = readings(load_model(), DEFAULT)
+    return space([reading.coordinate for reading in found])
 
 
 def load_model() -> Any:
