@@ -7,6 +7,7 @@ from jaxpets._src.fused_rollout import FusedRollout
 from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput
 from jaxpets._src.types import (
     Candidates,
+    Coordinate,
     Dataset,
     DynamicsFn,
     Env,
@@ -27,6 +28,7 @@ from jaxpets._src.unroll import UnrollState
 
 __all__ = [
     "Candidates",
+    "Coordinate",
     "Dataset",
     "DynamicsFn",
     "Ensemble",
