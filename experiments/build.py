@@ -56,7 +56,7 @@ def build(config: Config) -> Parts:
     size = ensemble_config(config.model)
     trained = _ensemble(size, jaxpets.Precision.TF32)
     planned = _ensemble(size, jaxpets.Precision(config.planner.precision))
-    arm = make_arm(config, planned)
+    arm = make_arm(config, planned, env)
     explored = config.num_trials * config.trial_length
     finetuned = config.finetune_trials * config.task_length
 
@@ -81,7 +81,7 @@ def build(config: Config) -> Parts:
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
 
-    explorer, explored_by = (random, "none")
+    explorer, explored_by = arm.planner or random, "none"
     if arm.reward_fn is not None:
         explorer, explored_by = planner(arm.reward_fn, config.planner)
     actor, performed_by = planner(reward, config.task_planner)

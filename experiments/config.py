@@ -18,8 +18,25 @@ from jaxpets import EnsembleConfig, FitConfig
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
 ArmName = Literal[
-    "epistemic", "count", "random", "oracle", "one-step", "info-gain", "best"
+    "epistemic",
+    "count",
+    "random",
+    "oracle",
+    "one-step",
+    "info-gain",
+    "best",
+    "jensen-renyi",
+    "opax",
+    "ensemble-std",
+    "rnd",
+    "particle-entropy",
+    "mixture",
+    "pink-noise",
 ]
+# Arms that act without a plan, and what a log calls the planner of each.
+UNPLANNED = {"random": "random", "pink-noise": "noise"}
+# Arms that one network will do for.
+UNDIVIDED = (*UNPLANNED, "count", "oracle", "rnd", "particle-entropy")
 EngineName = Literal["mjx", "mujoco"]
 TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
 NUM_TASKS = len(get_args(TaskName)) - 1  # of "all"
@@ -127,7 +144,9 @@ class Basics:
     arm: Annotated[ArmName, EXPLORED, COUNTED] = "epistemic"
     """What exploration seeks: disagreement of the ensemble (SU-PETS), rare states
     (count), nothing (random), the forward task (oracle), one-step disagreement,
-    information gain, or disagreement in units of the data (best)."""
+    information gain, disagreement in units of the data (best), or what other methods
+    seek: jensen-renyi (MAX), opax, ensemble-std (CEE-US), rnd, particle-entropy (APT);
+    the forward task and disagreement (mixture), or nothing, in pink-noise."""
     seeds: Annotated[tuple[Seed, ...], EXPLORED, COUNTED] = (0,)
     """One run each, side by side in one program; 0 to 2**32 - 1."""
     engine: EngineName = "mjx"

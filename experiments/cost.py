@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Sequence
 
-from experiments.config import NUM_TASKS, Config, PlannerConfig
+from experiments.config import NUM_TASKS, UNPLANNED, Config, PlannerConfig
 from experiments.errors import UsageError
 
 # Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
@@ -79,7 +79,7 @@ def _planned_steps(config: Config) -> int:
     """Returns how many steps of environments a seed plans for in a phase."""
     if config.phase == "explore":
         planned = config.num_trials - config.random_trials
-        return planned * config.trial_length if config.arm != "random" else 0
+        return planned * config.trial_length if config.arm not in UNPLANNED else 0
     zero_shot = config.phase == "zero-shot"
     trials = config.eval_trials if zero_shot else config.finetune_trials
     return _num_tasks(config) * trials * config.task_length

@@ -27,7 +27,7 @@ from experiments.build import (
     build,
     trial_keys,
 )
-from experiments.config import Config
+from experiments.config import UNPLANNED, Config
 from experiments.parallel import devices
 from experiments.parallel.devices import SEED, TASK, Placement
 from experiments.progress import Progress
@@ -65,8 +65,8 @@ class _Exploration:
 
     def labels(self, trial: int) -> list[dict[str, Any]]:
         config = self.config
-        random = trial <= config.random_trials or config.arm == "random"
-        planner = "random" if random else "plan"
+        at_first = trial <= config.random_trials
+        planner = "random" if at_first else UNPLANNED.get(config.arm, "plan")
         common = {"phase": "explore", "arm": config.arm, "planner": planner}
         steps = trial * config.trial_length
         return [

@@ -3,7 +3,7 @@
 import re
 from typing import Any, get_args
 
-from experiments.config import Config, PlannerConfig, TaskName
+from experiments.config import UNDIVIDED, Config, PlannerConfig, TaskName
 from experiments.entries import Mark, entries, flag
 from experiments.errors import UsageError
 from experiments.storage import rundir
@@ -44,7 +44,7 @@ def validate(config: Config) -> None:
 def _check_members(config: Config) -> None:
     members = config.model.num_members
     require(
-        members >= 2 or config.arm in ("count", "random", "oracle"),
+        members >= 2 or config.arm in UNDIVIDED,
         "--model.num-members",
         members,
         f"2 or more for --arm {config.arm}; one member never disagrees",

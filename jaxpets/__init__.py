@@ -34,7 +34,9 @@ from jaxpets._src.fused_rollout import fused_rollout
 from jaxpets._src.learner import Learner, LearnerState, RewardData, learner
 from jaxpets._src.network import Precision
 from jaxpets._src.over_seeds import SEED_AXES, over_seeds
-from jaxpets._src.plan import plan, random_planner
+from jaxpets._src.per_state import per_state
+from jaxpets._src.plan import plan
+from jaxpets._src.random_planner import random_planner
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import (
     Env,
@@ -78,6 +80,7 @@ __all__ = [
     "optimizers",
     "over_seeds",
     "particle_rollout",
+    "per_state",
     "plan",
     "random_planner",
     "rewards",

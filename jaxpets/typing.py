@@ -6,6 +6,8 @@ from jaxpets._src.fitter import FitMetrics, FitState, Fitter
 from jaxpets._src.fused_rollout import FusedRollout
 from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput
 from jaxpets._src.types import (
+    Candidates,
+    Coordinate,
     Dataset,
     DynamicsFn,
     Env,
@@ -25,6 +27,8 @@ from jaxpets._src.types import (
 from jaxpets._src.unroll import UnrollState
 
 __all__ = [
+    "Candidates",
+    "Coordinate",
     "Dataset",
     "DynamicsFn",
     "Ensemble",

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import jaxpets
+from jaxpets import coordinates
 
 PACKAGE = Path(jaxpets.__file__).parent
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -21,6 +22,8 @@ LAYERS = {
     "_src.checks": 0,
     "_src.moments": 1,
     "_src.elites": 1,
+    "_src.returns": 1,
+    "_src.batches": 1,
     "_src.chunks": 1,
     "_src.network": 1,
     "_src.action_box": 1,
@@ -35,11 +38,18 @@ LAYERS = {
     "_src.icem": 2,
     "_src.mppi": 2,
     "_src.rollout": 2,
+    "_src.per_state": 2,
     "_src.sharded": 2,
     "_src.rewards": 2,
+    "_src.score": 2,
+    "_src.one_step": 3,
+    "_src.particle_entropy": 2,
+    "_src.random_planner": 3,
+    "_src.distillation": 6,
     "_src.pseudo_counts": 2,
     "_src.dataset": 2,
     "_src.check_space": 2,
+    "_src.coordinates": 2,
     "_src.unroll": 2,
     "_src.ensemble_config": 2,
     "_src.ensemble_params": 3,
@@ -50,9 +60,14 @@ LAYERS = {
     "_src.over_seeds": 7,
     "envs.extra": 0,
     "envs.native": 1,
-    "envs.half_cheetah": 2,
+    "envs.symmetry": 1,
+    "envs.observations": 2,
+    "envs.engines": 2,
+    "envs.half_cheetah": 3,
+    "envs.mujoco_env": 3,
     "envs.adapters": 2,
     "envs": 3,
+    "coordinates": 8,
     "datasets": 8,
     "optimizers": 8,
     "rewards": 8,
@@ -62,6 +77,7 @@ LAYERS = {
 
 MODULES_OF_NAMES = [
     jaxpets,
+    coordinates,
     jaxpets.datasets,
     jaxpets.optimizers,
     jaxpets.rewards,
@@ -72,7 +88,14 @@ MODULES_OF_NAMES = [
 HOMES = {
     "flax": {"_src.network"},
     "optax": {"_src.fitter"},
-    "mujoco": {"envs.half_cheetah", "envs.native"},
+    "mujoco": {
+        "envs.engines",
+        "envs.half_cheetah",
+        "envs.mujoco_env",
+        "envs.native",
+        "envs.observations",
+        "envs.symmetry",
+    },
     "brax": set(),
     "gymnasium": set(),
     "orbax": set(),

@@ -58,6 +58,9 @@ OPTIMIZERS = {
     "icem": lambda **box: jaxpets.optimizers.icem(
         num_samples=48, num_elites=6, num_iterations=2, **box
     ),
+    "icem-loop": lambda **box: jaxpets.optimizers.icem(
+        num_samples=48, num_elites=6, num_iterations=2, unroll=False, **box
+    ),
     "mppi": lambda **box: jaxpets.optimizers.mppi(
         num_samples=64, num_iterations=4, temperature=0.1, **box
     ),

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments.config import UNPLANNED
 from experiments.report import (
     caveats,
     coverage,
@@ -135,7 +136,8 @@ def _draw(rows: Sequence[Row], found: Scores, explored: int, files: _Files) -> N
     """Draws Figure 4 and what exploration was like."""
     figures.figure_4(files.figure_4, _panels(rows, found, explored), explored)
     # Random actions are of no value to anyone, whatever a log says.
-    planned = [r for r in rows if "random" not in (r.arm, r.data.get("planner"))]
+    at_random = {*UNPLANNED, *UNPLANNED.values()}
+    planned = [r for r in rows if not at_random & {r.arm, r.data.get("planner")}]
     value = _curves(exploring(planned, "value"))
     turns = _curves(exploring(rows, "turns"))
     figures.exploration(files.exploration, value, turns)

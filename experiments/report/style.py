@@ -31,7 +31,7 @@ _ARMS = {
     "oracle": GREEN,
     "one-step": PURPLE,
 }
-_OTHER_ARMS = (SKY, "#8C564B")
+_OTHER_ARMS = (SKY, "#8C564B", "#882255", "#999933", "#332288", "#44AA99", "#DDCC77")
 
 STYLE: Any = {
     "axes.spines.top": False,
@@ -48,7 +48,7 @@ STYLE: Any = {
 
 
 def arm_color(arm: str, arms: Sequence[str]) -> str:
-    """Returns an arm's colour; arms without their own share two more in turn."""
+    """Returns an arm's colour; arms without their own take others in turn."""
     unknown = [name for name in arms if name not in _ARMS]
     if arm in _ARMS:
         return _ARMS[arm]

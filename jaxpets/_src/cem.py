@@ -1,7 +1,7 @@
 """The cross-entropy method over action sequences, as PETS uses it."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,16 @@ from jaxpets._src.checks import (
     check_count,
     check_flag,
     check_key,
-    check_real,
     check_record,
+    check_scalar,
 )
-from jaxpets._src.elites import select_elites
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.elites import join_iterations, select_elites
+from jaxpets._src.types import (
+    Candidates,
+    ObjectiveFn,
+    Solution,
+    TrajectoryOptimizer,
+)
 
 # Mean and variance, both `[H, A]`, and the value `[]` of the elites.
 _Carry = tuple[Array, Array, Array]
@@ -42,10 +47,11 @@ def cem(
     num_samples: int = 500,
     num_elites: int = 50,
     num_iterations: int = 5,
-    momentum: float = 0.1,
-    min_variance: float = 1e-3,
+    momentum: float | Array = 0.1,
+    min_variance: float | Array = 1e-3,
     legacy_variance: bool = False,
     unroll: bool = False,
+    keep_candidates: bool = False,
 ) -> TrajectoryOptimizer:
     """Builds the cross-entropy method with the settings of PETS.
 
@@ -63,15 +69,17 @@ def cem(
       num_samples: N.
       num_elites: how many of the best samples shape the next iteration.
       num_iterations: iterations per call.
-      momentum: share of the old mean and variance that is kept.
+      momentum: share of the old mean and variance that is kept; may be traced.
       min_variance: the search freezes once no variance exceeds this, in units of a
-        box scaled to `[-1, 1]`.
+        box scaled to `[-1, 1]`; may be traced.
       legacy_variance: take the elites' variance without momentum, as the first
         public PETS code did by mistake until November 2018.
       unroll: compile the iterations one after the other and not as a loop. The search
         is the same, its code num_iterations times as long; on a CPU it may need more
         memory. For rollouts as short as those of `fused_rollout` on a GPU, beside
         which the programs that a loop adds count.
+      keep_candidates: return all sequences that were tried, with their values, in
+        `Solution.candidates`; for drawing them.
 
     Returns:
       A TrajectoryOptimizer.
@@ -92,10 +100,11 @@ def cem(
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
-    check_real("momentum", momentum, 0.0, 1.0)
-    check_real("min_variance", min_variance, 0.0)
+    check_scalar("momentum", momentum, 0.0, 1.0)
+    check_scalar("min_variance", min_variance, 0.0)
     check_flag("legacy_variance", legacy_variance)
     check_flag("unroll", unroll)
+    check_flag("keep_candidates", keep_candidates)
     shape = (horizon, box.center.shape[0])
 
     def sample(key: Array, mean: Array, variance: Array) -> Array:
@@ -117,7 +126,7 @@ def cem(
         check_record("state", state, CEMState)
         check_array("state.mean", state.mean, shape)
 
-        def iterate(carry: _Carry, keys: Array) -> tuple[_Carry, None]:
+        def iterate(carry: _Carry, keys: Array) -> tuple[_Carry, Any]:
             mean, variance, _value = carry
             sample_key, value_key = keys
             actions = sample(sample_key, mean, variance)
@@ -132,12 +141,16 @@ def cem(
             )
             searching = jnp.max(variance / box.half_width**2) > min_variance
             keep = functools.partial(jnp.where, searching)
-            return jax.tree.map(keep, new, carry), None
+            tried = Candidates(actions, values) if keep_candidates else ()
+            return jax.tree.map(keep, new, carry), tried
 
         variance = jnp.broadcast_to(box.half_width**2 / 4, shape)
         start = (state.mean, variance, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
-        (mean, _, value), _ = jax.lax.scan(iterate, start, keys, unroll=bool(unroll))
-        return Solution(actions=mean, value=value), CEMState(mean=box.shift(mean))
+        (mean, _, value), tried = jax.lax.scan(
+            iterate, start, keys, unroll=bool(unroll)
+        )
+        solution = Solution(mean, value, join_iterations(tried))
+        return solution, CEMState(mean=box.shift(mean))
 
     return TrajectoryOptimizer(init, step)

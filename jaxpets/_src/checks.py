@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 
 def check_count(name: str, value: Any, minimum: int = 1) -> None:
@@ -51,6 +52,19 @@ def check_real(name: str, value: Any, low: float, high: float = math.inf) -> Non
         if high == math.inf:
             valid = f"finite and at least {low:g}"
         raise ValueError(f"{name} must be {valid}, got {value!r}.")
+
+
+def check_scalar(name: str, value: Any, low: float, high: float = math.inf) -> None:
+    """Raises unless `value` is a number in `[low, high]` or a float32 scalar in it.
+
+    A traced one is not checked for its range: it is what a sweep maps over.
+    """
+    if isinstance(value, Array):
+        check_array(name, value, [])
+        if isinstance(value, Tracer):
+            return
+        value = float(value)
+    check_real(name, value, low, high)
 
 
 def check_reals(name: str, values: Any, low: float) -> None:

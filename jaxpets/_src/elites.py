@@ -1,6 +1,6 @@
 """The best candidates of a search, and what they say about where to search on."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,15 @@ class Elites(NamedTuple):
     mean: Array
     variance: Array
     value: Array
+
+
+def join_iterations(tried: Any) -> Any:
+    """Returns Candidates `[I, N, ...]` as `[I * N, ...]`, and () as it is."""
+
+    def join(x: Array) -> Array:
+        return jax.lax.collapse(x, 0, 2)
+
+    return jax.tree.map(join, tried)
 
 
 def is_valid(values: Array) -> Array:

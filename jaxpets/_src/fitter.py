@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from jaxpets._src.batches import Batch, minibatch, rows_shown, shuffle
 from jaxpets._src.checks import (
     check_count,
     check_flag,
@@ -24,6 +25,7 @@ from jaxpets._src.types import Dataset
 
 # Updates between two looks at how many there are: a GPU's host waits for each.
 _UPDATES_AT_ONCE = 4
+Optimizer = optax.GradientTransformation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,13 +101,6 @@ class Fitter(NamedTuple):
     ]
 
 
-class _Batch(NamedTuple):
-    inputs: Array  # [E, batch_size, F + A]
-    targets: Array  # [E, batch_size, D]
-    weight: Array  # [batch_size], sums to one; 0 past the end of the data
-    num_rows: Array  # [] rows that count
-
-
 class _Totals(NamedTuple):
     nll: Array  # [] sum over rows
     mse: Array  # [] sum over rows
@@ -119,9 +114,7 @@ class _Progress(NamedTuple):
     totals: _Totals  # of this epoch
 
 
-def fitter(
-    ensemble: Ensemble, optimizer: optax.GradientTransformation, config: FitConfig
-) -> Fitter:
+def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitter:
     """Builds the trainer of PETS.
 
     One call refits the scaler on all data, draws a bootstrap per member (as many rows
@@ -152,14 +145,14 @@ def fitter(
     """
     check_record("ensemble", ensemble, Ensemble)
     check_record("config", config, FitConfig)
-    _check_optimizer(optimizer)
+    check_optimizer(optimizer)
     check_params = params_check(ensemble.init)
 
     def init(params: EnsembleParams) -> FitState:
         check_params(params)
         return FitState(optimizer.init(params.network))
 
-    def update(progress: _Progress, batch: _Batch, done: Array) -> _Progress:
+    def update(progress: _Progress, batch: Batch, done: Array) -> _Progress:
         network, opt_state, num_skipped, totals = progress
         grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
         # The whole loss is not asked for: the value of its penalties, which only their
@@ -201,17 +194,17 @@ def fitter(
         data = ensemble.encode(scaler, dataset.data)
         rows_key, epochs_key = jax.random.split(key)
         shape = (ensemble.num_members, dataset.data.obs.shape[0])
-        rows = _bootstrap(rows_key, config, shape, size)
+        rows = rows_shown(rows_key, config.bootstrap, shape, size)
         num_batches = (size + config.batch_size - 1) // config.batch_size
 
         def epoch(
             progress: _Progress, number_and_key: tuple[Array, Array]
         ) -> tuple[_Progress, None]:
             number, key = number_and_key
-            shuffled = _shuffle(key, rows, size)
+            shuffled = shuffle(key, rows, size)
 
             def one(i: Array, progress: _Progress) -> _Progress:
-                batch = _minibatch(data, shuffled, i, config.batch_size, size)
+                batch = minibatch(data, shuffled, i, config.batch_size, size)
                 done = number + i / jnp.maximum(num_batches, 1)
                 return update(progress, batch, done / config.num_epochs)
 
@@ -235,44 +228,14 @@ def fitter(
     return Fitter(init, step)
 
 
-def _check_optimizer(optimizer: Any) -> None:
+def check_optimizer(optimizer: Any) -> None:
+    """Raises unless `optimizer` is one of optax."""
     if not isinstance(optimizer, optax.GradientTransformation):
         kind = type(optimizer).__name__
         raise TypeError(
             f"optimizer must be of optax, as optax.adam(1e-3), got {optimizer!r} "
             f"({kind})."
         )
-
-
-def _bootstrap(
-    key: Array, config: FitConfig, shape: tuple[int, int], size: Array
-) -> Array:
-    """Returns which rows each member is shown, `[E, C]`, of which `size` count."""
-    if config.bootstrap:
-        return jax.random.randint(key, shape, 0, jnp.maximum(size, 1))
-    return jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32), shape)
-
-
-def _shuffle(key: Array, rows: Array, size: Array) -> Array:
-    """Returns the rows `[E, C]` in another order; the first `size` stay the first."""
-    order = jax.random.uniform(key, rows.shape, jnp.float32)
-    order = jnp.where(jnp.arange(rows.shape[1]) < size, order, jnp.inf)
-    return jnp.take_along_axis(rows, jnp.argsort(order, axis=1), axis=1)
-
-
-def _minibatch(
-    data: tuple[Array, Array], rows: Array, i: Array, batch_size: int, size: Array
-) -> _Batch:
-    """Returns batch i of the data; there may be few rows left for it, or none."""
-    position = i * batch_size + jnp.arange(batch_size, dtype=jnp.int32)
-    # Past the data lies what need not be finite, which no weight masks.
-    within = jnp.minimum(position, size - 1)
-    picked = jnp.take(rows, within, axis=1, mode="clip")
-    used = (position < size).astype(jnp.float32)
-    num_rows = jnp.float32(jnp.clip(size - i * batch_size, 0, batch_size))
-    inputs, targets = data
-    weight = used / jnp.maximum(num_rows, 1.0)
-    return _Batch(inputs[picked], targets[picked], weight, num_rows)
 
 
 def _loop(

@@ -1,6 +1,6 @@
 """iCEM: a cross-entropy method for small budgets."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,15 @@ from jaxpets._src.checks import (
     check_key,
     check_real,
     check_record,
+    check_scalar,
 )
-from jaxpets._src.elites import select_elites
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.elites import join_iterations, select_elites
+from jaxpets._src.types import (
+    Candidates,
+    ObjectiveFn,
+    Solution,
+    TrajectoryOptimizer,
+)
 
 
 class ICEMState(NamedTuple):
@@ -32,6 +38,16 @@ class ICEMState(NamedTuple):
     elites: Array
 
 
+class _Found(NamedTuple):
+    """What an iteration leaves to the next one; `kept` `[K, H, A]`, `value` `[]`."""
+
+    mean: Array
+    std: Array
+    kept: Array
+    best: Array
+    value: Array
+
+
 def icem(
     *,
     horizon: int,
@@ -40,12 +56,14 @@ def icem(
     num_samples: int = 64,
     num_elites: int = 10,
     num_iterations: int = 3,
-    momentum: float = 0.1,
-    noise_beta: float = 2.0,
-    init_std: float = 0.5,
+    momentum: float | Array = 0.1,
+    noise_beta: float | Array = 2.0,
+    init_std: float | Array = 0.5,
     kept_fraction: float = 0.3,
     decay: float = 1.25,
     execute_best: bool = False,
+    unroll: bool = True,
+    keep_candidates: bool = False,
 ) -> TrajectoryOptimizer:
     """Builds iCEM (Pinneri et al., 2020).
 
@@ -61,14 +79,22 @@ def icem(
       num_samples: N of the first iteration.
       num_elites: how many of the best samples shape the next iteration.
       num_iterations: iterations per call.
-      momentum: share of the old mean and standard deviation that is kept.
-      noise_beta: 0 is white noise, 2 a random walk.
+      momentum: share of the old mean and standard deviation that is kept; may
+        be traced.
+      noise_beta: 0 is white noise, 2 a random walk; may be traced.
       init_std: standard deviation at the start of a call, in units of a box scaled to
-        `[-1, 1]`.
+        `[-1, 1]`; may be traced.
       kept_fraction: share of the elites that is kept.
       decay: shrinking factor of the population.
       execute_best: return the best sequence seen in the last iteration, as in the
         paper of iCEM, and not the mean, which is less prone to a model's errors.
+      unroll: compile the iterations one after the other, each with its population.
+        False compiles them as one loop, in about the time of one iteration. The same
+        sequences are tried, but all iterations imagine as many as the first and the
+        mean, and leave the surplus out: it takes longer to run, the more the steeper
+        the decay, and a model's noise is another draw.
+      keep_candidates: return all sequences that were tried, with their values, in
+        `Solution.candidates`; for drawing them.
 
     Returns:
       A TrajectoryOptimizer.
@@ -81,12 +107,8 @@ def icem(
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
-    check_real("momentum", momentum, 0.0, 1.0)
-    check_real("noise_beta", noise_beta, 0.0)
-    check_real("init_std", init_std, 1e-6)
-    check_real("kept_fraction", kept_fraction, 0.0, 1.0)
-    check_real("decay", decay, 1.0)
-    check_flag("execute_best", execute_best)
+    _check_numbers(momentum, noise_beta, init_std, kept_fraction, decay)
+    _check_flags(execute_best, unroll, keep_candidates)
     shape = (horizon, box.center.shape[0])
     num_kept = round(kept_fraction * num_elites)
     smallest = min(num_samples, 2 * num_elites)
@@ -99,6 +121,52 @@ def icem(
         # No sequence was found yet: the middle of the box stands in.
         return ICEMState(mean, jnp.broadcast_to(mean, (num_kept, *shape)))
 
+    def evaluate(
+        objective_fn: ObjectiveFn,
+        keys: Array,
+        found: _Found,
+        population: int,
+        with_mean: bool,
+    ) -> Candidates:
+        sample_key, value_key = keys
+        noise = colored_noise(sample_key, noise_beta, (population, *shape))
+        actions = box.clip(found.mean + found.std * noise)
+        candidates = [actions, found.kept]
+        if with_mean:
+            candidates.append(found.mean[None])
+        actions = jnp.concatenate(candidates)
+        values = objective_fn(value_key, actions)
+        check_array("objective_fn's result", values, [actions.shape[0]])
+        return Candidates(actions, values)
+
+    def improve(found: _Found, actions: Array, values: Array) -> _Found:
+        elites = select_elites(values, actions, num_elites)
+        mean = box.clip(momentum * found.mean + (1 - momentum) * elites.mean)
+        std = momentum * found.std + (1 - momentum) * jnp.sqrt(elites.variance)
+        kept, best = elites.actions[:num_kept], elites.actions[0]
+        return _Found(mean, std, kept, best, elites.value)
+
+    def loop(
+        objective_fn: ObjectiveFn, keys: Array, found: _Found
+    ) -> tuple[_Found, Any]:
+        row = jnp.arange(num_samples + num_kept + 1)
+
+        def iterate(found: _Found, inputs: tuple[Array, ...]) -> tuple[_Found, Any]:
+            keys, population, is_last = inputs
+            tried = evaluate(objective_fn, keys, found, num_samples, True)
+            is_surplus = (row >= population) & (row < num_samples)
+            is_surplus |= (row == row[-1]) & ~is_last
+            # Below the worst value: there are always enough others to be elites.
+            values = jnp.where(is_surplus, -jnp.inf, tried.values)
+            return improve(
+                found, tried.actions, values
+            ), tried if keep_candidates else ()
+
+        is_last = jnp.arange(num_iterations) == num_iterations - 1
+        inputs = (keys, jnp.array(populations, jnp.int32), is_last)
+        found, tried = jax.lax.scan(iterate, found, inputs)
+        return found, join_iterations(tried)
+
     def step(
         objective_fn: ObjectiveFn, key: Array, state: ICEMState
     ) -> tuple[Solution, ICEMState]:
@@ -108,32 +176,46 @@ def icem(
         check_array("state.mean", mean, shape)
         check_array("state.elites", kept, [num_kept, *shape])
         std = jnp.broadcast_to(init_std * box.half_width, shape)
+        found = _Found(mean, std, kept, mean, jnp.zeros((), jnp.float32))
         keys = jax.random.split(key, (num_iterations, 2))
-        best = value = None
-        # A Python loop, because the population, a shape, shrinks.
-        for i, population in enumerate(populations):
-            sample_key, value_key = keys[i]
-            noise = _colored_noise(sample_key, noise_beta, (population, *shape))
-            actions = box.clip(mean + std * noise)
-            candidates = [actions, kept]
-            if i == num_iterations - 1:
-                candidates.append(mean[None])
-            actions = jnp.concatenate(candidates)
-            values = objective_fn(value_key, actions)
-            check_array("objective_fn's result", values, [actions.shape[0]])
-            elites = select_elites(values, actions, num_elites)
-            mean = box.clip(momentum * mean + (1 - momentum) * elites.mean)
-            std = momentum * std + (1 - momentum) * jnp.sqrt(elites.variance)
-            kept, best = elites.actions[:num_kept], elites.actions[0]
-            value = elites.value
-        assert best is not None and value is not None
-        solution = Solution(actions=best if execute_best else mean, value=value)
-        return solution, ICEMState(box.shift(mean), box.shift(kept))
+        if unroll:
+            every: list[Any] = []
+            for i, population in enumerate(populations):
+                is_last = i == num_iterations - 1
+                tried = evaluate(objective_fn, keys[i], found, population, is_last)
+                found = improve(found, *tried)
+                every.append(tried if keep_candidates else ())
+            tried = jax.tree.map(lambda *parts: jnp.concatenate(parts), *every)
+        else:
+            found, tried = loop(objective_fn, keys, found)
+        best = found.best if execute_best else found.mean
+        state = ICEMState(box.shift(found.mean), box.shift(found.kept))
+        return Solution(best, found.value, tried), state
 
     return TrajectoryOptimizer(init, step)
 
 
-def _colored_noise(key: Array, beta: float, shape: tuple[int, ...]) -> Array:
+def _check_numbers(
+    momentum: float | Array,
+    noise_beta: float | Array,
+    init_std: float | Array,
+    kept_fraction: float,
+    decay: float,
+) -> None:
+    check_scalar("momentum", momentum, 0.0, 1.0)
+    check_scalar("noise_beta", noise_beta, 0.0)
+    check_scalar("init_std", init_std, 1e-6)
+    check_real("kept_fraction", kept_fraction, 0.0, 1.0)
+    check_real("decay", decay, 1.0)
+
+
+def _check_flags(execute_best: bool, unroll: bool, keep_candidates: bool) -> None:
+    check_flag("execute_best", execute_best)
+    check_flag("unroll", unroll)
+    check_flag("keep_candidates", keep_candidates)
+
+
+def colored_noise(key: Array, beta: float | Array, shape: tuple[int, ...]) -> Array:
     """Draws Gaussian noise of unit variance, correlated along axis -2 (time).
 
     The power of frequency f is proportional to `1 / f^beta`; entries of the last axis

@@ -1,6 +1,6 @@
 """Model-predictive path integral control: a softmax over sampled sequences."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,18 @@ from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
     check_array,
     check_count,
+    check_flag,
     check_key,
-    check_real,
     check_record,
+    check_scalar,
 )
-from jaxpets._src.elites import is_valid
-from jaxpets._src.types import ObjectiveFn, Solution, TrajectoryOptimizer
+from jaxpets._src.elites import is_valid, join_iterations
+from jaxpets._src.types import (
+    Candidates,
+    ObjectiveFn,
+    Solution,
+    TrajectoryOptimizer,
+)
 
 
 class MPPIState(NamedTuple):
@@ -36,8 +42,9 @@ def mppi(
     action_high: ArrayLike,
     num_samples: int = 500,
     num_iterations: int = 1,
-    std: float = 0.5,
-    temperature: float = 1.0,
+    std: float | Array = 0.5,
+    temperature: float | Array = 1.0,
+    keep_candidates: bool = False,
 ) -> TrajectoryOptimizer:
     """Builds MPPI (Williams et al., 2017).
 
@@ -51,8 +58,11 @@ def mppi(
       action_high: `[A]`.
       num_samples: N.
       num_iterations: iterations per call.
-      std: of the noise, in units of a box scaled to `[-1, 1]`.
-      temperature: 0.1 follows the best few samples, 10 averages over all.
+      std: of the noise, in units of a box scaled to `[-1, 1]`; may be traced.
+      temperature: 0.1 follows the best few samples, 10 averages over all; may be
+        traced.
+      keep_candidates: return all sequences that were tried, with their values, in
+        `Solution.candidates`; for drawing them.
 
     Returns:
       A TrajectoryOptimizer; its Solution's value is the weighted mean of the last
@@ -65,8 +75,9 @@ def mppi(
     box = action_box(action_low, action_high)
     check_count("num_samples", num_samples, minimum=2)
     check_count("num_iterations", num_iterations)
-    check_real("std", std, 1e-6)
-    check_real("temperature", temperature, 1e-6)
+    check_scalar("std", std, 1e-6)
+    check_scalar("temperature", temperature, 1e-6)
+    check_flag("keep_candidates", keep_candidates)
     scale = std * box.half_width
     shape = (horizon, box.center.shape[0])
 
@@ -80,7 +91,7 @@ def mppi(
         check_record("state", state, MPPIState)
         check_array("state.mean", state.mean, shape)
 
-        def iterate(mean: Array, keys: Array) -> tuple[Array, Array]:
+        def iterate(mean: Array, keys: Array) -> tuple[Array, tuple[Array, Any]]:
             sample_key, value_key = keys
             noise = jax.random.normal(sample_key, (num_samples, *shape), jnp.float32)
             actions = box.clip(mean + scale * noise)
@@ -96,11 +107,12 @@ def mppi(
                 (values - jnp.max(values)) / (temperature * spread), where=kept
             )
             mean = jnp.einsum("n,nha->ha", weights, actions)
-            return box.clip(mean), jnp.sum(weights * values)
+            tried = Candidates(actions, values) if keep_candidates else ()
+            return box.clip(mean), (jnp.sum(weights * values), tried)
 
         keys = jax.random.split(key, (num_iterations, 2))
-        mean, values = jax.lax.scan(iterate, state.mean, keys)
+        mean, (values, tried) = jax.lax.scan(iterate, state.mean, keys)
         state = MPPIState(mean=box.shift(mean))
-        return Solution(actions=mean, value=values[-1]), state
+        return Solution(mean, values[-1], join_iterations(tried)), state
 
     return TrajectoryOptimizer(init, step)

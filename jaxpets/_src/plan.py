@@ -4,12 +4,9 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
-from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
     check_callable,
     check_count,
@@ -18,6 +15,7 @@ from jaxpets._src.checks import (
 )
 from jaxpets._src.chunks import chunked
 from jaxpets._src.elites import WORST_VALUE
+from jaxpets._src.returns import candidate_returns
 from jaxpets._src.types import (
     ModelRolloutFn,
     Planner,
@@ -35,6 +33,9 @@ def plan(
     optimizer: TrajectoryOptimizer,
     *,
     chunk_size: int | None = None,
+    terminal_fn: Callable[[Any, Array], Array] | None = None,
+    discount: float | Array = 1.0,
+    risk_fn: Callable[[Array], Array] | None = None,
 ) -> Planner:
     """Builds a model-predictive controller.
 
@@ -65,6 +66,16 @@ def plan(
         `[E, B, ...]`, as a DynamicsFn does, or not at all, and the key must be JAX's
         default kind, partitionable threefry. Chunks follow one another, so take the
         largest that fits.
+      terminal_fn: `(PlanParams.reward, obs [E, P, D]) -> bool [E, P]`, or `[]` for all
+        particles: whether an imagined state ends the trial. The step that leads into
+        such a state still earns its reward, as in Gymnasium; all later steps of that
+        particle earn nothing, and need not be finite. The start is not asked. A reward
+        that returns `[]` counts for the share of particles that go on; it still sees
+        all of them.
+      discount: in [0, 1], a number or a traced float32 scalar; the reward of step h,
+        from 0, counts `discount^h`.
+      risk_fn: `(returns [E, P]) -> []`, what a candidate is worth given the returns of
+        its particles; None for their mean.
 
     Returns:
       A Planner.
@@ -72,33 +83,16 @@ def plan(
     Raises:
       TypeError, ValueError: if an argument is not what it should be; from `step`, at
         trace time, when params is no PlanParams, the state belongs to another search,
-        rollout_fn or reward_fn return a shape that the contract does not allow, or
+        a function returns a shape or dtype that the contract does not allow, or
         chunks are asked of another kind of key; when it is compiled, if the noise
         cannot be divided.
     """
     check_callable("rollout_fn", rollout_fn)
-    check_callable("reward_fn", reward_fn)
     check_record("optimizer", optimizer, TrajectoryOptimizer)
     if chunk_size is not None:
         check_count("chunk_size", chunk_size)
 
-    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
-        particles = obs.shape[:-1]
-        reward = reward_fn(params, obs, action, next_obs)
-        if not hasattr(reward, "dtype") and not isinstance(reward, (int, float)):
-            kind = type(reward).__name__
-            raise TypeError(f"reward_fn must return an array, got {kind}.")
-        reward = jnp.asarray(reward)
-        if reward.dtype != jnp.float32:
-            raise TypeError(f"reward_fn must return float32, got {reward.dtype}.")
-        if reward.shape not in ((), particles):
-            raise ValueError(
-                f"reward_fn must return shape () or {particles}, got {reward.shape}."
-            )
-        return jnp.mean(reward)
-
-    rewards = jax.vmap(reward, (None, 1, 0, 1))  # over candidates
-    rewards = jax.vmap(rewards, (None, 0, 0, 0))  # over time
+    returns = candidate_returns(reward_fn, terminal_fn, discount, risk_fn)
 
     def step(
         params: PlanParams, key: Array, state: Any, obs: Any
@@ -117,8 +111,7 @@ def plan(
                 )
             # In the order of time, in which it was imagined, no part of it is copied.
             path = path.transpose(1, 2, 0, 3, 4)
-            steps = (path[:-1], actions.swapaxes(0, 1), path[1:])
-            value = rewards(params.reward, *steps).sum(0)
+            value = returns(params.reward, path, actions.swapaxes(0, 1))
             finite = jnp.isfinite(value)
             return jnp.where(
                 finite, jnp.clip(value, WORST_VALUE, -WORST_VALUE), WORST_VALUE
@@ -126,7 +119,7 @@ def plan(
 
         whole = objective if chunk_size is None else chunked(objective, chunk_size)
         solution, state = optimizer.step(whole, key, state)
-        return PlanOutput(solution.actions[0], solution.actions, solution.value), state
+        return PlanOutput(solution.actions[0], *solution), state
 
     return Planner(optimizer.init, step)
 
@@ -136,32 +129,3 @@ def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], 
     if isinstance(rollout_fn, ModelRolloutFn):
         return rollout_fn.bind(params)
     return functools.partial(rollout_fn, params)
-
-
-def random_planner(action_low: ArrayLike, action_high: ArrayLike) -> Planner:
-    """Builds a planner that draws every action uniformly from the box.
-
-    The random arm of the paper, and the first trial of every other arm.
-
-    Args:
-      action_low: `[A]`.
-      action_high: `[A]`.
-
-    Returns:
-      A Planner with an empty state; its plans have length one and value zero.
-
-    Raises:
-      TypeError, ValueError: if the box is not finite or empty.
-    """
-    box = action_box(action_low, action_high)
-
-    def step(
-        params: PlanParams, key: Array, state: tuple[()], obs: Any
-    ) -> tuple[PlanOutput, tuple[()]]:
-        del params, obs
-        check_key("key", key)
-        uniform = jax.random.uniform(key, box.low.shape, jnp.float32)
-        action = box.low + (box.high - box.low) * uniform
-        return PlanOutput(action, action[None], jnp.zeros((), jnp.float32)), state
-
-    return Planner(tuple, step)

@@ -1,13 +1,18 @@
 """Rewards that seek, or shun, what the ensemble does not know."""
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
-from jaxpets._src.checks import check_array, check_callable, check_real
+from jaxpets._src.checks import (
+    check_array,
+    check_callable,
+    check_real,
+    check_record,
+)
 from jaxpets._src.types import RewardFn
 
 
@@ -34,8 +39,7 @@ def epistemic(
       ValueError: if the shapes do not fit, or there is only one member.
     """
     del obs, action
-    variance = _variance_of_means(baseline_variance, next_obs)
-    return _mean(jnp.sqrt(variance / baseline_variance))
+    return _mean(jnp.sqrt(_relative_variance(baseline_variance, next_obs)))
 
 
 def information_gain(
@@ -55,44 +59,32 @@ def information_gain(
       ValueError: if the shapes do not fit, or there is only one member.
     """
     del obs, action
-    variance = _variance_of_means(baseline_variance, next_obs)
-    return _mean(jnp.log1p(variance / baseline_variance) / 2)
+    return _mean(jnp.log1p(_relative_variance(baseline_variance, next_obs)) / 2)
 
 
-def one_step_disagreement(
-    predict_fn: Callable[[Any, Array, Array], tuple[Array, Array]],
-) -> RewardFn:
-    """Builds the reward of one-step disagreement (the family of Plan2Explore).
+def ensemble_std(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+    """Disagreement in the units of the observation (Sancaktar et al., 2022, CEE-US).
 
-    Every particle is shown to all members: `r = 1/D * sum_k sqrt(v[k] / s[k])` with v
-    the variance over members of their predicted means and s the mean of their
-    predicted variances. Unlike `epistemic` it does not count how far the members'
-    paths drifted apart before this step. It costs E times the model of the rollout.
+    `r = sum_k sqrt(v[k])`, with `v` of `epistemic`: as there, every member has followed
+    the plan from the start. Since no noise stands below it, a dimension of large
+    numbers, as the speed of a joint, outweighs the others. It is D times `epistemic`
+    over a w_base of ones. CEE-US has no particles, for its networks are deterministic,
+    and divides by E - 1 in the variance where this divides by E: a constant factor.
 
     Args:
-      predict_fn: `(params, obs [E, B, D], action [B, A]) -> (mean, variance)`, both
-        `[E, B, D]`, as `Ensemble.predict`.
+      params: unused.
+      obs: `[E, P, D]`, unused.
+      action: `[A]`, unused.
+      next_obs: `[E, P, D]`.
 
     Returns:
-      A RewardFn that returns `[E, P]` and whose params are those of predict_fn.
+      `[]`, in units of obs.
+
+    Raises:
+      ValueError: if the shapes do not fit, or there is only one member.
     """
-    check_callable("predict_fn", predict_fn)
-
-    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
-        del next_obs
-        check_array("obs", obs, ["E", "P", "D"])
-        num_members, per_member, obs_size = obs.shape
-        _check_members(num_members)
-        rows = num_members * per_member
-        shared = jnp.broadcast_to(
-            obs.reshape(rows, obs_size), (num_members, rows, obs_size)
-        )
-        actions = jnp.broadcast_to(action, (rows, *action.shape))
-        mean, variance = predict_fn(params, shared, actions)
-        ratio = jnp.var(mean, axis=0) / jnp.mean(variance, axis=0)
-        return jnp.mean(jnp.sqrt(ratio), -1).reshape(num_members, per_member)
-
-    return reward
+    del params, obs, action
+    return jnp.sum(jnp.sqrt(_variance_of_means(next_obs)))
 
 
 def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
@@ -118,7 +110,7 @@ def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         check_array("next_obs", next_obs, ["E", "P", "D"])
-        _check_members(next_obs.shape[0])
+        check_members(next_obs.shape[0])
         rewards = reward_fn(params, obs, action, next_obs)
         check_array("reward", rewards, [*next_obs.shape[:2]])
         by_member = jnp.mean(rewards, axis=1)
@@ -127,11 +119,69 @@ def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
     return reward
 
 
-def _variance_of_means(baseline_variance: Array, next_obs: Array) -> Array:
+class MixtureData(NamedTuple):
+    """The data of a `mixture`.
+
+    Attributes:
+      extrinsic: of the reward of the task.
+      intrinsic: of the reward that explores.
+      weight: `[]`, of the second against the first; it may change between calls.
+    """
+
+    extrinsic: Any
+    intrinsic: Any
+    weight: ArrayLike
+
+
+def mixture(extrinsic_fn: RewardFn, intrinsic_fn: RewardFn) -> RewardFn:
+    """Builds the reward of a task that goes on exploring (Bellemare et al., 2016).
+
+    `r = r_extrinsic + weight * r_intrinsic`. With it a model is fine-tuned on a task
+    and still seeks what it does not know; weight 0 is the task alone.
+
+    Args:
+      extrinsic_fn: the task.
+      intrinsic_fn: what explores. Either may return `[]` or `[E, P]`.
+
+    Returns:
+      A RewardFn whose params are MixtureData. It returns `[]` if both do, else
+      `[E, P]`. It raises TypeError or ValueError for other params.
+
+    Raises:
+      TypeError: unless both are functions.
+    """
+    check_callable("extrinsic_fn", extrinsic_fn)
+    check_callable("intrinsic_fn", intrinsic_fn)
+
+    def reward(
+        params: MixtureData, obs: Array, action: Array, next_obs: Array
+    ) -> Array:
+        check_record("params", params, MixtureData)
+        check_array("params.weight", params.weight, [])
+        step = (obs, action, next_obs)
+        extrinsic = extrinsic_fn(params.extrinsic, *step)
+        intrinsic = intrinsic_fn(params.intrinsic, *step)
+        # What is already reduced counts for every particle.
+        shape = jnp.broadcast_shapes(extrinsic.shape, intrinsic.shape)
+        extrinsic, intrinsic = (
+            jnp.broadcast_to(x, shape) for x in (extrinsic, intrinsic)
+        )
+        return extrinsic + params.weight * intrinsic
+
+    return reward
+
+
+def _relative_variance(baseline_variance: Array, next_obs: Array) -> Array:
+    """Returns the variance of the members over another one, `[D]`."""
+    variance = _variance_of_means(next_obs)
+    check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
+    return variance / baseline_variance
+
+
+def _variance_of_means(next_obs: Array) -> Array:
     """Returns the variance over members of each member's mean particle, `[D]`."""
     check_array("next_obs", next_obs, ["E", "P", "D"])
-    check_array("baseline_variance", baseline_variance, [next_obs.shape[-1]])
-    _check_members(next_obs.shape[0])
+    check_members(next_obs.shape[0])
     # Member by member, so that XLA reads the path once: of jnp.var it makes three GPU
     # programs, which write the means and read them again. The code grows with E.
     means = [jnp.mean(member, axis=0) for member in next_obs]
@@ -145,7 +195,8 @@ def _mean(x: Array) -> Array:
     return jnp.sum(x / x.size)
 
 
-def _check_members(num_members: int) -> None:
+def check_members(num_members: int) -> None:
+    """Raises unless there are two members, who may disagree."""
     if num_members < 2:
         raise ValueError(
             "disagreement needs an ensemble of at least 2 members, got "

@@ -3,6 +3,7 @@
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_key, check_record
@@ -23,8 +24,8 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
     Where the objective draws nothing, only rounding differs.
 
     Args:
-      optimizer: the search; one whose number of candidates is the same in every
-        iteration, as `cem` and `mppi`, or always divisible.
+      optimizer: the search. Where its candidates cannot be divided equally, as those
+        of `icem`, the last one is imagined again on the last devices.
       axis_name: of the mesh; key, state and params must be equal along it. The
         `check_vma` of `jax.shard_map` cannot see that they stay so: turn it off.
 
@@ -33,7 +34,6 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
 
     Raises:
       TypeError: if optimizer is no TrajectoryOptimizer.
-      ValueError: from `step`, when traced, if N is not a multiple of the axis' size.
       NameError: from `step`, when traced, if no axis has that name.
 
     >>> import jax.numpy as jnp
@@ -58,15 +58,14 @@ def sharded(optimizer: TrajectoryOptimizer, axis_name: str) -> TrajectoryOptimiz
 
         def objective(key: Array, actions: Array) -> Array:
             num_samples = actions.shape[0]
-            if num_samples % num_devices:
-                raise ValueError(
-                    f"num_samples must be a multiple of the size of axis "
-                    f"{axis_name!r} ({num_devices}), got {num_samples}."
-                )
-            size = num_samples // num_devices
+            size = -(-num_samples // num_devices)
+            if surplus := size * num_devices - num_samples:
+                last = jnp.broadcast_to(actions[-1:], (surplus, *actions.shape[1:]))
+                actions = jnp.concatenate([actions, last])
             own = jax.lax.dynamic_slice_in_dim(actions, index * size, size)
             values = objective_fn(jax.random.fold_in(key, index), own)
-            return cast(Array, jax.lax.all_gather(values, axis_name, tiled=True))
+            values = cast(Array, jax.lax.all_gather(values, axis_name, tiled=True))
+            return values[:num_samples] if surplus else values
 
         return optimizer.step(objective, key, state)
 

@@ -49,16 +49,30 @@ class PlanParams(NamedTuple):
     reward: Any = ()
 
 
+class Candidates(NamedTuple):
+    """The M sequences that a search tried in one call, iteration after iteration.
+
+    Attributes:
+      actions: `[M, H, A]`.
+      values: `[M]`, what the objective answered.
+    """
+
+    actions: Array
+    values: Array
+
+
 class Solution(NamedTuple):
     """What a trajectory optimizer found.
 
     Attributes:
       actions: `[H, A]`.
       value: `[]`, the mean value of the last elites.
+      candidates: all that was tried, if the search keeps it; else ().
     """
 
     actions: Array
     value: Array
+    candidates: Candidates | tuple[()] = ()
 
 
 class PlanOutput(NamedTuple):
@@ -69,11 +83,14 @@ class PlanOutput(NamedTuple):
       actions: `[H, A]`, the whole plan.
       value: `[]`, the return under the model, summed over the horizon: the mean over
         the last elites, in the reward's unit.
+      candidates: all that was tried, if the search keeps it; else (). Their paths are
+        one call of the rollout.
     """
 
     action: Array
     actions: Array
     value: Array
+    candidates: Candidates | tuple[()] = ()
 
 
 class EnvState(NamedTuple):
@@ -195,6 +212,26 @@ class Planner(NamedTuple):
     step: Callable[[PlanParams, Array, Any, Any], tuple[PlanOutput, Any]]
 
 
+class Coordinate(NamedTuple):
+    """One entry of an observation, and how a model sees it.
+
+    Attributes:
+      name: unique among the entries.
+      kind: what the model predicts. "relative": the change. "absolute": the value.
+        "angle": the change of an unwrapped angle in rad, which the network reads as
+        sine and cosine. "quaternion": one of four rows in a run, w, x, y and z of a
+        unit quaternion; the model turns them together and keeps them unit.
+      is_input: whether the network reads it.
+      is_bounded: whether imagination keeps it near the data. Never true of an angle,
+        which grows without limit, and of a quaternion, which is bounded as it is.
+    """
+
+    name: str
+    kind: str = "relative"
+    is_input: bool = True
+    is_bounded: bool = True
+
+
 class Env(NamedTuple):
     """A simulator of one environment; batch it with `jax.vmap`.
 
@@ -203,12 +240,14 @@ class Env(NamedTuple):
       step: `(EnvState, action [A]) -> EnvState`.
       action_low: `[A]`, finite.
       action_high: `[A]`, finite.
+      coordinates: D entries of the observation; none where nobody has named them.
     """
 
     reset: Callable[[Array], EnvState]
     step: Callable[[EnvState, Array], EnvState]
     action_low: Array
     action_high: Array
+    coordinates: tuple[Coordinate, ...] = ()
 
 
 class ModelSpace(NamedTuple):
@@ -224,9 +263,11 @@ class ModelSpace(NamedTuple):
       next_obs: `(obs, target) -> [..., D]`, the inverse of `target`.
       bound: `(obs, low [D], high [D]) -> [..., D]`, keeps imagined observations in a
         box. Leave free what grows without limit in the world, as an unwrapped angle.
+      coordinates: the D entries that it was built from; none in a space of your own.
     """
 
     features: Callable[[Array], Array]
     target: Callable[[Array, Array], Array]
     next_obs: Callable[[Array, Array], Array]
     bound: Callable[[Array, Array, Array], Array]
+    coordinates: tuple[Coordinate, ...] = ()

@@ -5,11 +5,9 @@ forward velocity over the whole environment step; every trial starts within 0.00
 the same state; nothing ends a trial; all geoms hit the floor (not so in Brax).
 """
 
-import contextlib
 import importlib.resources
-import io
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import jax
@@ -17,9 +15,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_key, check_record
+from jaxpets._src.coordinates import space
 from jaxpets._src.types import Env, EnvState, ModelSpace
+from jaxpets.envs.engines import Physics, mjx_engine, native_engine
 from jaxpets.envs.extra import needs_extra
-from jaxpets.envs.native import native_physics
+from jaxpets.envs.observations import DEFAULT, readings
 
 with needs_extra():
     import mujoco
@@ -43,20 +43,6 @@ _RESET_STD = 0.001
 # 1000 kg/m^3 (MuJoCo's default) scaled to the total mass of 14 kg that the file asks
 # for by `settotalmass`, an attribute MuJoCo is about to drop.
 _DENSITY = "660.8849500774735"
-
-
-class Physics(NamedTuple):
-    """The part of MuJoCo's state from which the rest follows.
-
-    Attributes:
-      qpos: `[9]`, positions in m and rad.
-      qvel: `[9]`, velocities in m/s and rad/s.
-      qacc_warmstart: `[9]`, where the contact solver starts.
-    """
-
-    qpos: Array
-    qvel: Array
-    qacc_warmstart: Array
 
 
 class TaskWeights(NamedTuple):
@@ -128,33 +114,13 @@ def task_reward(
 def model_space() -> ModelSpace:
     """Returns the coordinates of PETS for this observation.
 
-    Features drop the finite-difference velocity and show the pitch as sine and
-    cosine: `[F] = 18`. Targets are changes, but for that velocity, which is predicted
-    itself. Imagined states are bounded except for the pitch, which grows by a turn a
-    second in a flip.
+    They follow from the joints, as those of any robot. Features drop the
+    finite-difference velocity and show the pitch as sine and cosine: `[F] = 18`.
+    Targets are changes, but for that velocity, which is predicted itself. Imagined
+    states are bounded except for the pitch, which grows by a turn a second in a flip.
     """
-
-    def features(obs: Array) -> Array:
-        pitch = obs[..., PITCH, None]
-        rest = obs[..., PITCH + 1 :]
-        parts = [obs[..., HEIGHT, None], jnp.sin(pitch), jnp.cos(pitch), rest]
-        return jnp.concatenate(parts, axis=-1)
-
-    # What the targets are relative to: everything but the velocity.
-    relative = jnp.ones((OBS_SIZE,), jnp.float32).at[FORWARD_VELOCITY].set(0.0)
-    bounded = jnp.arange(OBS_SIZE) != PITCH
-
-    def bound(obs: Array, low: Array, high: Array) -> Array:
-        low = jnp.where(bounded, low, -jnp.inf)
-        return jnp.clip(obs, low, jnp.where(bounded, high, jnp.inf))
-
-    def target(obs: Array, next_obs: Array) -> Array:
-        return next_obs - relative * obs
-
-    def next_obs(obs: Array, target: Array) -> Array:
-        return relative * obs + target
-
-    return ModelSpace(features, target, next_obs, bound)
+    found = readings(load_model(), DEFAULT)
+    return space([reading.coordinate for reading in found])
 
 
 def load_model() -> Any:
@@ -190,37 +156,10 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     """
     check_count("iterations", iterations)
     check_count("ls_iterations", ls_iterations)
-    # MJX writes to stdout when it finds no warp, which it does not need here.
-    with needs_extra(), contextlib.redirect_stdout(io.StringIO()):
-        from mujoco import mjx
-
-    host_model = load_model()
-    host_model.opt.iterations = iterations
-    host_model.opt.ls_iterations = ls_iterations
-    model = mjx.put_model(host_model, impl="jax")
-    template = mjx.make_data(host_model, impl="jax")
-    mjx_step = cast(Callable[[Any, Any], Any], mjx.step)
-
-    def substep(_: Array, data: Any) -> Any:
-        return mjx_step(model, data)
-
-    def advance(before: Physics, action: Array) -> Physics:
-        data: Any = template.replace(
-            qpos=before.qpos,
-            qvel=before.qvel,
-            qacc_warmstart=before.qacc_warmstart,
-            ctrl=action,
-        )
-        # GPUs multiply in TF32 by default: an error 400 times that of float32. And MJX
-        # does not trace under strict promotion, which a caller may have set.
-        with (
-            jax.default_matmul_precision("highest"),
-            jax.numpy_dtype_promotion("standard"),
-        ):
-            data = cast(Any, jax.lax.fori_loop(0, _FRAME_SKIP, substep, data))
-        return Physics(data.qpos, data.qvel, data.qacc_warmstart)
-
-    return _env(host_model, advance)
+    model = load_model()
+    model.opt.iterations = iterations
+    model.opt.ls_iterations = ls_iterations
+    return _env(model, mjx_engine(model, num_substeps=_FRAME_SKIP).advance)
 
 
 def half_cheetah_native(*, num_threads: int | None = None) -> Env:
@@ -242,15 +181,8 @@ def half_cheetah_native(*, num_threads: int | None = None) -> Env:
       TypeError, ValueError: unless num_threads is None or a positive Python integer.
     """
     model = load_model()
-    physics_fn = native_physics(
-        model, num_substeps=_FRAME_SKIP, num_threads=num_threads
-    )
-
-    def advance(before: Physics, action: Array) -> Physics:
-        # MuJoCo clips as well, but takes an infinite control for 0.
-        return Physics(*physics_fn(*before, jnp.clip(action, -1.0, 1.0)))
-
-    return _env(model, advance)
+    engine = native_engine(model, num_substeps=_FRAME_SKIP, num_threads=num_threads)
+    return _env(model, engine.advance)
 
 
 def _env(model: Any, advance: Callable[[Physics, Array], Physics]) -> Env:

@@ -2,9 +2,9 @@
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,15 @@ from jaxpets.envs.extra import needs_extra
 with needs_extra():
     import mujoco
 
+_BITS = cast(Any, mujoco).mjtState  # made at import, where pyright does not see it
+# One row: the clock, then the inputs in the order in which MuJoCo packs them.
+_INPUTS = int(
+    _BITS.mjSTATE_TIME
+    | _BITS.mjSTATE_QPOS
+    | _BITS.mjSTATE_QVEL
+    | _BITS.mjSTATE_WARMSTART
+    | _BITS.mjSTATE_CTRL
+)
 # `(qpos, qvel, qacc_warmstart, ctrl) -> (qpos, qvel, qacc_warmstart)`.
 PhysicsFn = Callable[[Array, Array, Array, Array], tuple[Array, Array, Array]]
 
@@ -53,46 +62,105 @@ def native_physics(
         state of the model is its positions and velocities.
     """
     check_count("num_substeps", num_substeps)
-    if num_threads is None:
-        num_threads = _num_cores()
-    check_count("num_threads", num_threads)
-    c: Any = mujoco  # its names are made at import, where pyright does not see them
-    bits = c.mjtState
-    if c.mj_stateSize(model, bits.mjSTATE_FULLPHYSICS) != 1 + model.nq + model.nv:
+    c: Any = mujoco
+    if c.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != 1 + model.nq + model.nv:
         raise ValueError("model must have no state but positions and velocities.")
-    # One row: the clock, then the inputs in the order in which MuJoCo packs them.
-    spec = int(
-        bits.mjSTATE_TIME
-        | bits.mjSTATE_QPOS
-        | bits.mjSTATE_QVEL
-        | bits.mjSTATE_WARMSTART
-        | bits.mjSTATE_CTRL
-    )
     ends = np.cumsum([model.nq, model.nv, model.nv]).tolist()
     size = ends[-1]
 
+    def visit(row: np.ndarray, data: Any) -> None:
+        # In place. Python holds its lock for 1 us of the 30 that a row takes.
+        c.mj_setState(model, data, row, _INPUTS)
+        c.mj_step(model, data, num_substeps)
+        c.mj_getState(model, data, row, _INPUTS)
+
+    run = _host_function(model, visit, size, num_threads)
+
+    def step(
+        qpos: Array, qvel: Array, qacc_warmstart: Array, ctrl: Array
+    ) -> tuple[Array, Array, Array]:
+        outputs = run(qpos, qvel, qacc_warmstart, ctrl)
+        return outputs[: ends[0]], outputs[ends[0] : ends[1]], outputs[ends[1] :]
+
+    return step
+
+
+def native_readings(
+    model: Any, places: Sequence[tuple[str, int]], *, num_threads: int | None = None
+) -> Callable[[Array, Array, Array, Array], Array]:
+    """Builds what reads MuJoCo's data in a state: sensors, places, velocities.
+
+    As `native_physics` it runs in C, once for a whole batch. Everything is of the state
+    it is given, forces and accelerations too: not of the substep before it.
+
+    Args:
+      model: as `native_physics` takes it.
+      places: R names of arrays of MuJoCo's data and indices in them, read as one row.
+      num_threads: as there.
+
+    Returns:
+      `(qpos [Q], qvel [V], qacc_warmstart [V], ctrl [U]) -> [R]`, float32; NaN where an
+      input is not finite.
+    """
+    c: Any = mujoco
+    num_inputs = c.mj_stateSize(model, _INPUTS)
+    size = len(places)
+    # Neighbours of one array are copied at once.
+    arrays: dict[str, tuple[list[int], list[int]]] = {}
+    for i, (source, place) in enumerate(places):
+        outs, ins = arrays.setdefault(source, ([], []))
+        outs.append(1 + i)
+        ins.append(place)
+
+    def visit(row: np.ndarray, data: Any) -> None:
+        c.mj_setState(model, data, row[:num_inputs], _INPUTS)
+        c.mj_forward(model, data)
+        if "subtree_linvel" in arrays:
+            c.mj_subtreeVel(model, data)
+        for source, (outs, ins) in arrays.items():
+            row[outs] = getattr(data, source).reshape(-1)[ins]
+
+    return _host_function(model, visit, size, num_threads)
+
+
+def _host_function(
+    model: Any,
+    visit: Callable[[np.ndarray, Any], None],
+    size: int,
+    num_threads: int | None,
+) -> Callable[..., Array]:
+    """Builds a function of JAX that has C MuJoCo visit every row of a batch.
+
+    Args:
+      model: a compiled MuJoCo model.
+      visit: gets a row, in which the results replace the inputs behind the clock, and
+        scratch of its own thread.
+      size: how many numbers are left in a row.
+      num_threads: at most this many; by default the cores this process may use.
+    """
+    if num_threads is None:
+        num_threads = _num_cores()
+    check_count("num_threads", num_threads)
+    c: Any = mujoco
     lock = threading.Lock()
     pool = ThreadPoolExecutor(max(1, num_threads - 1), "jaxpets-native")
     buffers: list[Any] = []  # scratch of one thread each
 
-    def step_rows(rows: np.ndarray, data: Any) -> None:
-        # In place. Python holds its lock for 1 us of the 30 that a row takes.
+    def visit_rows(rows: np.ndarray, data: Any) -> None:
         for row in rows:
-            c.mj_setState(model, data, row, spec)
-            c.mj_step(model, data, num_substeps)
-            c.mj_getState(model, data, row, spec)
+            visit(row, data)
 
-    def step_batch(rows: np.ndarray) -> None:
+    def visit_batch(rows: np.ndarray) -> None:
         count = min(num_threads, max(1, len(rows) // _MIN_ROWS_PER_THREAD))
         with lock:
             while len(buffers) < count:
                 buffers.append(c.MjData(model))
             # Every count-th row, as neighbours may all be lying and take longer.
             others = [
-                pool.submit(step_rows, rows[i::count], buffers[i])
+                pool.submit(visit_rows, rows[i::count], buffers[i])
                 for i in range(1, count)
             ]
-            step_rows(rows[::count], buffers[0])
+            visit_rows(rows[::count], buffers[0])
             for other in others:
                 other.result()
 
@@ -100,18 +168,17 @@ def native_physics(
         # NumPy only: an operation of JAX in here can wait for itself for ever.
         inputs = np.asarray(inputs)
         flat = inputs.reshape(-1, inputs.shape[-1])
-        rows = np.full((len(flat), 1 + flat.shape[1]), _START_TIME, np.float64)
-        rows[:, 1:] = flat
-        step_batch(rows)
+        width = 1 + max(flat.shape[1], size)
+        rows = np.full((len(flat), width), _START_TIME, np.float64)
+        rows[:, 1 : 1 + flat.shape[1]] = flat
+        visit_batch(rows)
         rows[rows[:, 0] < _START_TIME] = np.nan
         outputs = rows[:, 1 : 1 + size].astype(np.float32)
         return outputs.reshape(*inputs.shape[:-1], size)
 
-    def step(
-        qpos: Array, qvel: Array, qacc_warmstart: Array, ctrl: Array
-    ) -> tuple[Array, Array, Array]:
+    def run(*parts: Array) -> Array:
         # As one array, so that a GPU copies once each way.
-        inputs = jnp.concatenate([qpos, qvel, qacc_warmstart, ctrl])
+        inputs = jnp.concatenate(parts)
         # MuJoCo takes a control that is not finite for 0, and logs every such state.
         finite = jnp.isfinite(inputs).all()
         outputs = jax.pure_callback(
@@ -120,10 +187,9 @@ def native_physics(
             jnp.where(finite, inputs, 0.0),
             vmap_method="broadcast_all",
         )
-        outputs = jnp.where(finite, outputs, jnp.nan)
-        return outputs[: ends[0]], outputs[ends[0] : ends[1]], outputs[ends[1] :]
+        return jnp.where(finite, outputs, jnp.nan)
 
-    return step
+    return run
 
 
 def _num_cores() -> int:

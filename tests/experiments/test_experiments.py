@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import time
+from typing import get_args
 
 import jax
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 import runs
 from runs import learner, rows
 
+from experiments.config import UNPLANNED, ArmName
 from experiments.run import main
 from experiments.storage import checkpoint, rundir
 from jaxpets.envs import half_cheetah
@@ -300,7 +302,7 @@ def _check_task(folder, labels, trials=2):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "arm", ["count", "random", "oracle", "one-step", "info-gain", "best"]
+    "arm", [arm for arm in get_args(ArmName) if arm != "epistemic"]
 )
 def test_every_arm_explores(arm, tmp_path, capsys):
     flags = ("--arm", arm, "--num-trials", "2", "--out", str(tmp_path))
@@ -308,5 +310,6 @@ def test_every_arm_explores(arm, tmp_path, capsys):
     log = rows(tmp_path / f"smoke-{arm}")
     assert [(row["arm"], row["trial"]) for row in log] == [(arm, 1), (arm, 2)]
     assert np.isfinite([row["value"] for row in log]).all()
-    assert (log[1]["value"] == 0.0) == (arm == "random")
+    assert (log[1]["value"] == 0.0) == (arm in UNPLANNED)
+    assert log[1]["planner"] == UNPLANNED.get(arm, "plan")
     assert capsys.readouterr().out == ""

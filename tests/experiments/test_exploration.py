@@ -14,7 +14,7 @@ def describe(tree):
     return jax.tree.map(lambda x: (x.shape, x.dtype), tree)
 
 
-@pytest.mark.parametrize("arm", ["epistemic", "count", "one-step"])
+@pytest.mark.parametrize("arm", ["epistemic", "count", "opax", "rnd", "mixture"])
 def test_a_learner_gets_room_for_more_trials(arm):
     """Whatever its reward keeps, it has the form of one that had the room at once."""
     config = dataclasses.replace(

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from small_logs import EXPLORED, explore_rows, write_run
 
 from experiments.errors import CheckpointError, UsageError
-from experiments.report import logs, style, task_sections
+from experiments.report import logs, report, style, task_sections
 from experiments.report.report import load, write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
@@ -127,6 +127,23 @@ def test_all_trials_of_the_random_arm_are_random(tmp_path):
     write_arm(tmp_path / "runs", "random", [1.0])
     text, _ = report_of(tmp_path / "runs")
     assert "mean of 3 trials: forward -2.0" in text  # -(trial + seed)
+
+
+def test_noise_is_neither_a_plan_nor_a_random_trial(tmp_path, monkeypatch):
+    """Its first trial is that of all arms; the others have turns, but no value."""
+    write_arm(tmp_path / "runs", "pink-noise", [1.0])
+    log = tmp_path / "runs" / "laptop-pink-noise" / "metrics.jsonl"
+    log.write_text(log.read_text().replace('"plan"', '"noise"'))
+    drawn, draw = [], report.figures.exploration
+
+    def exploration(target, value, turns):
+        drawn.append((list(value), list(turns)))
+        draw(target, value, turns)
+
+    monkeypatch.setattr(report.figures, "exploration", exploration)
+    text, _ = report_of(tmp_path / "runs")
+    assert drawn == [([], ["pink-noise"])]
+    assert "mean of 1 trials: forward -1.0" in text
 
 
 def test_a_variant_is_a_row_of_its_own(out):

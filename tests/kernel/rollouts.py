@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import jaxpets
-from jaxpets import Precision
+from jaxpets import Precision, coordinates
 from jaxpets._src.fused_rollout import rollout_of_kind
 from jaxpets._src.kernel import build
 from jaxpets._src.kernel.build import Kind
+from jaxpets.coordinates import Coordinate
 from jaxpets.envs import half_cheetah as hc
 
 _real = build._compiler
@@ -56,6 +57,13 @@ RICH = jaxpets.ModelSpace(
     next_obs=lambda obs, target: WEIGHT * obs + target * 0.5,
     bound=lambda obs, low, high: jnp.where(WEIGHT > 0.7, jnp.clip(obs, low, high), obs),
 )
+# One of each kind of coordinate that a robot may have.
+ROBOT = coordinates.space([
+    Coordinate("speed", "absolute", is_input=False),
+    *(Coordinate(f"q{x}", "quaternion", is_bounded=False) for x in "wxyz"),
+    Coordinate("pole", "angle", is_bounded=False),
+    Coordinate("rate"),
+])  # fmt: skip
 # The noise alone: nothing is kept from step to step.
 FORGETFUL = jaxpets.delta_space()._replace(next_obs=lambda obs, target: target)
 
@@ -150,6 +158,7 @@ CASES = {
     "obs 16": Case(obs_size=16, action_size=3, hidden_sizes=(64,)),
     "half_cheetah": CHEETAH,
     "rich": Case(obs_size=4, space=RICH),
+    "robot": Case(obs_size=7, space=ROBOT),
 }
 
 

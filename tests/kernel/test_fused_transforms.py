@@ -132,6 +132,26 @@ def test_a_plan_is_that_of_the_scan(engine):
     toys.assert_trees_close(planned(engine)(*start()), want, rtol=1e-3, atol=1e-3)
 
 
+def test_a_plan_that_ends_has_the_values_of_the_scan(engine):
+    params, key, obs = start()
+    actions = SMALL.args()[-1]
+
+    def values(rollout):
+        planner = jaxpets.plan(
+            rollout,
+            toys.reach,
+            toys.probe(actions),
+            terminal_fn=lambda params, obs: obs[..., 0] > params,
+            discount=0.9,
+            risk_fn=jnp.min,
+        )
+        return jax.jit(planner.step)(params, key, planner.init(), obs)[1]
+
+    # A path is that of the scan to 1e-4, and none comes as near to the end.
+    want = values(SMALL.scan())
+    np.testing.assert_allclose(values(engine.fused(SMALL)), want, rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize(("name", "chunk_size"), [("cem", 25), ("icem", 20)])
 def test_a_plan_in_chunks_is_the_plan(engine, name, chunk_size):
     got, want = (planned(engine, size, name)(*start()) for size in (chunk_size, None))

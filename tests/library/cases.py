@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 import toys
 
 import jaxpets
@@ -16,6 +17,9 @@ from jaxpets.envs import half_cheetah as hc
 MODEL = toys.small_ensemble()
 MODELS = jax.jit(jax.vmap(MODEL.init))(jax.random.split(jax.random.key(0), 3))
 ENV = toys.cart_env()
+RND = jaxpets.rewards.random_network_distillation(
+    optax.adam(1e-3), obs_size=2, hidden_size=8, num_features=4
+)
 NOISY = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=4)
 LEARNED = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
 
@@ -94,29 +98,55 @@ def step_of(i, size=2, action_size=1):
     return particles(i, size), action, particles(i + 3, size)
 
 
-def counts(i):
-    projection = jaxpets.rewards.simhash(jax.random.key(5), 8, 2)
+def mixed(i):
+    weight = jnp.float32(0.1 * i)
+    return jaxpets.rewards.MixtureData(jnp.float32(i), jnp.ones(2), weight)
+
+
+def dataset(i):
     rows = particles(i).reshape(12, 2)
     data = jaxpets.Transition(rows, rows[:, :1], rows)
-    dataset = jaxpets.datasets.append(jaxpets.datasets.init(16, 2, 1), data)
-    return jaxpets.rewards.count_states(projection, dataset)
+    return jaxpets.datasets.append(jaxpets.datasets.init(16, 2, 1), data)
 
 
-def mixture(params, obs, action, next_obs):
-    step = (obs, action, next_obs)
-    novelty = jaxpets.rewards.epistemic(params[1], *step)
-    return toys.reach(params[0], *step) + 0.1 * novelty
+def counts(i):
+    projection = jaxpets.rewards.simhash(jax.random.key(5), 8, 2)
+    return jaxpets.rewards.count_states(projection, dataset(i))
+
+
+def visited(i):
+    return jaxpets.rewards.visited_states(dataset(i), 8)
+
+
+def coloured_case():
+    high = jnp.ones(1)
+    planner = jaxpets.random_planner(-high, high, noise_beta=1.0, period=5)
+
+    def variant(i):
+        return PlanParams(()), key_of(i), planner.init(), cart_obs(i)
+
+    return Case(planner.step, variant, (2, 1))
+
+
+def jittered(gain, key, obs, action):
+    noise = jax.random.normal(key, obs.shape, jnp.float32)
+    return toys.cart(gain, None, obs, action) + 0.01 * noise
 
 
 CASES = {
     **{f"plan-{n}": functools.partial(planner_case, n) for n in toys.OPTIMIZERS},
     "random_planner": lambda: planner_case("random"),
+    "random_planner-coloured": coloured_case,
     **{n: functools.partial(optimizer_case, n) for n in toys.OPTIMIZERS},
     "particle_rollout": lambda: Case(
         NOISY, lambda i: (jnp.float32(1 + i), key_of(i), cart_obs(i), actions(i))
     ),
     "particle_rollout-ensemble": lambda: Case(
         LEARNED, lambda i: (model(i), key_of(i), cart_obs(i), actions(i))
+    ),
+    "per_state": lambda: Case(
+        jaxpets.per_state(jittered),
+        lambda i: (jnp.float32(1 + i), key_of(i), particles(i), actions(i)[0]),
     ),
     "env_rollout": lambda: Case(
         env_rollout(ENV), lambda i: ((), key_of(i), ENV.reset(key_of(i)), actions(i))
@@ -143,9 +173,25 @@ CASES = {
         lambda i: (jax.tree.map(lambda x: x[i], hc.tasks()), *step_of(i, 18, 6)),
     ),
     "user-reward": lambda: Case(toys.reach, lambda i: (jnp.float32(i), *step_of(i))),
+    "ensemble_std": lambda: Case(
+        jaxpets.rewards.ensemble_std, lambda i: ((), *step_of(i))
+    ),
+    "opax": lambda: Case(
+        jaxpets.rewards.opax(MODEL.predict), lambda i: (model(i), *step_of(i))
+    ),
+    "jensen_renyi": lambda: Case(
+        jaxpets.rewards.jensen_renyi(MODEL.predict), lambda i: (model(i), *step_of(i))
+    ),
+    "particle_entropy": lambda: Case(
+        jaxpets.rewards.particle_entropy(3), lambda i: (visited(i), *step_of(i))
+    ),
+    "random_network_distillation": lambda: Case(
+        RND.reward, lambda i: (RND.init(key_of(i)), *step_of(i))
+    ),
     "mixture": lambda: Case(
-        mixture, lambda i: ((jnp.float32(i), jnp.ones(2)), *step_of(i))
+        jaxpets.rewards.mixture(toys.reach, jaxpets.rewards.epistemic),
+        lambda i: (mixed(i), *step_of(i)),
     ),
 }
 STATEFUL = [name for name in CASES if "plan" in name or name in toys.OPTIMIZERS]
-KEYED = [*STATEFUL, "particle_rollout", "particle_rollout-ensemble"]
+KEYED = [*STATEFUL, "particle_rollout", "particle_rollout-ensemble", "per_state"]

@@ -100,6 +100,9 @@ KEYED = {
     "plan": lambda key: decide(plan(), PlanParams(jnp.float32(1), 0.0), key),
     "random_planner": lambda key: decide(CHANCE, PlanParams(()), key, ()),
     "particle_rollout": lambda key: CART(jnp.float32(1), key, OBS, ACTIONS),
+    "per_state": lambda key: jaxpets.per_state(lambda params, key, obs, action: obs)(
+        (), key, PARTICLES, jnp.zeros((3, 1))
+    ),
     "env_rollout": lambda key: env_rollout(ENV)((), key, ENV.reset(KEY), ACTIONS),
     "fused_rollout": fused_call,
     "ensemble.init": MODEL.init,

@@ -40,6 +40,29 @@ def test_real_without_a_greatest_value_says_so():
             checks.check_real("decay", value, 0.0)
 
 
+@pytest.mark.parametrize("value", [0.5, np.float32(0.5), jnp.float32(0.5)])
+def test_scalar_takes_numbers_and_arrays(value):
+    checks.check_scalar("std", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [1.5, jnp.float32(1.5), jnp.float32(jnp.nan)])
+def test_scalar_refuses_what_is_out_of_range(value):
+    with pytest.raises(ValueError, match=r"std must be in \[0, 1\], got"):
+        checks.check_scalar("std", value, 0.0, 1.0)
+
+
+def test_scalar_takes_what_is_traced_if_it_is_one_float32():
+    def check(value):
+        checks.check_scalar("std", value, 0.0, 1.0)
+        return value
+
+    assert jax.vmap(check)(jnp.array([0.5, 2.0])).shape == (2,)
+    with pytest.raises(ValueError, match=r"std must be float32\[\], got float32\[2\]"):
+        jax.jit(check)(jnp.ones(2))
+    with pytest.raises(ValueError, match=r"std must be float32\[\], got int32\[\]"):
+        checks.check_scalar("std", jnp.int32(1), 0.0, 1.0)
+
+
 @pytest.mark.parametrize("value", [True, np.True_, False])
 def test_flag_takes_booleans(value):
     checks.check_flag("legacy", value)

@@ -6,9 +6,11 @@ import re
 import pytest
 
 import jaxpets
+from jaxpets import coordinates
 
 MODULES = [
     jaxpets,
+    coordinates,
     jaxpets.datasets,
     jaxpets.optimizers,
     jaxpets.rewards,

@@ -3,10 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from toys import bumpy, record
+from toys import assert_trees_close, bumpy, record
 
 import jaxpets
-from jaxpets._src.icem import _colored_noise
+from jaxpets._src.icem import colored_noise
 
 ONE = jnp.ones(2)
 
@@ -49,7 +49,7 @@ def test_few_left_of_many_rejected_make_the_plan(execute_best):
 
 @pytest.mark.parametrize("beta", [0.0, 1.0, 2.0, 3.0])
 def test_noise_has_its_colour(beta):
-    noise = _colored_noise(jax.random.key(1), beta, (2000, 64, 2))
+    noise = colored_noise(jax.random.key(1), beta, (2000, 64, 2))
     slope = reference.spectrum_slope(np.asarray(noise).swapaxes(1, 2))
     # 4000 series: the mean power of a frequency is known to 2 %.
     np.testing.assert_allclose(slope, -beta, atol=0.05)
@@ -58,7 +58,7 @@ def test_noise_has_its_colour(beta):
 @pytest.mark.parametrize("horizon", [1, 2, 15, 30])
 @pytest.mark.parametrize("beta", [0.0, 2.0])
 def test_noise_has_unit_variance_at_every_step(horizon, beta):
-    noise = _colored_noise(jax.random.key(2), beta, (20_000, horizon, 1))
+    noise = colored_noise(jax.random.key(2), beta, (20_000, horizon, 1))
     assert noise.shape == (20_000, horizon, 1) and noise.dtype == jnp.float32
     # The variance of 20,000 draws has a deviation of 1 %.
     np.testing.assert_allclose(np.var(noise, axis=0), 1.0, atol=0.05)
@@ -66,12 +66,12 @@ def test_noise_has_unit_variance_at_every_step(horizon, beta):
 
 
 def test_steep_noise_keeps_its_variance():
-    noise = _colored_noise(jax.random.key(3), 30.0, (4000, 30, 1))
+    noise = colored_noise(jax.random.key(3), 30.0, (4000, 30, 1))
     np.testing.assert_allclose(np.var(noise), 1.0, atol=0.1)
 
 
 def test_noise_is_independent_across_actions_and_samples():
-    noise = np.asarray(_colored_noise(jax.random.key(4), 2.0, (8000, 10, 3)))
+    noise = np.asarray(colored_noise(jax.random.key(4), 2.0, (8000, 10, 3)))
     for step in (0, 5):
         correlation = np.corrcoef(noise[:, step].T)
         # The deviation of a correlation of 8000 pairs is 0.011.
@@ -82,7 +82,7 @@ def test_noise_is_independent_across_actions_and_samples():
 
 def test_red_noise_is_smoother_than_white():
     def roughness(beta):
-        noise = _colored_noise(jax.random.key(5), beta, (500, 30, 1))
+        noise = colored_noise(jax.random.key(5), beta, (500, 30, 1))
         return float(jnp.mean(jnp.diff(noise, axis=1) ** 2))
 
     assert roughness(2.0) < 0.3 * roughness(0.0)
@@ -115,6 +115,22 @@ def test_population_shrinks_to_twice_the_elites():
     want = [size + kept for size in fresh]
     want[-1] += 1  # the mean itself
     assert sizes == want
+
+
+@pytest.mark.parametrize("num_iterations", [1, 5])
+@pytest.mark.parametrize("execute_best", [True, False])
+def test_a_loop_is_the_same_search(num_iterations, execute_best):
+    settings = dict(decay=1.6, num_iterations=num_iterations, execute_best=execute_best)
+    want = record(search(**settings), bumpy)
+    got = record(search(unroll=False, **settings), bumpy)
+    assert [len(actions) for actions in got.actions] == num_iterations * [60 + 4 + 1]
+    pairs = zip(want.actions, got.actions, strict=True)
+    for i, (few, many) in enumerate(pairs, start=1):
+        num_fresh = len(few) - 4 - (i == num_iterations)
+        np.testing.assert_allclose(many[:num_fresh], few[:num_fresh], atol=1e-5)
+    # A loop rounds otherwise; elites are the same.
+    assert_trees_close(got.solution, want.solution, rtol=1e-4, atol=1e-5)
+    assert_trees_close(got.state, want.state, rtol=1e-4, atol=1e-5)
 
 
 def test_elites_are_kept_within_a_call():

@@ -279,27 +279,3 @@ def test_wrong_keys_fail_when_traced():
         keys = jax.random.split(jax.random.key(0), 2)
         with pytest.raises(ValueError, match="key must be a single key"):
             each.step(PARAMS, keys, each.init(), jnp.zeros(2))
-
-
-def test_random_planner_is_uniform_in_the_box():
-    low, high = jnp.array([-1.0, 0.0]), jnp.array([1.0, 5.0])
-    planner = jaxpets.random_planner(low, high)
-    assert planner.init() == ()
-    keys = jax.random.split(jax.random.key(0), 4000)
-    out, state = jax.vmap(planner.step, (None, 0, None, None))(
-        PlanParams(()), keys, (), None
-    )
-    assert state == ()
-    assert out.actions.shape == (4000, 1, 2) and not out.value.any()
-    np.testing.assert_array_equal(out.action, out.actions[:, 0])
-    unit = np.asarray((out.action - low) / (high - low))
-    assert unit.min() >= 0 and unit.max() <= 1
-    # Deciles of a uniform law; the deviation of a share of 4000 draws is 0.005.
-    for column in unit.T:
-        share = np.histogram(column, bins=10, range=(0, 1))[0] / 4000
-        np.testing.assert_allclose(share, 0.1, atol=0.025)
-
-
-def test_random_planner_refuses_an_empty_box():
-    with pytest.raises(ValueError, match="low < high"):
-        jaxpets.random_planner(jnp.ones(1), -jnp.ones(1))

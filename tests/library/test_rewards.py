@@ -1,15 +1,15 @@
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-import toys
 
 import jaxpets
 from jaxpets.rewards import (
+    MixtureData,
+    ensemble_std,
     epistemic,
     information_gain,
-    one_step_disagreement,
+    mixture,
     pessimistic,
 )
 
@@ -140,59 +140,23 @@ def test_information_gain_refuses_what_does_not_fit():
         information_gain(jnp.asarray(base[:3]), states, jnp.zeros(2), states)
 
 
-# -- one-step disagreement -----------------------------------------------------------
+# -- standard deviation ----------------------------------------------------------------
 
 
-def affine(params, obs, action):
-    """Member e predicts w_e * obs + sum(action), with variance s_e."""
-    weight, variance = params
-    mean = weight[:, None, :] * obs + jnp.sum(action, axis=-1)[:, None]
-    return mean, jnp.broadcast_to(variance[:, None, :], mean.shape)
-
-
-def test_one_step_disagreement_equals_the_reference():
-    rng = np.random.default_rng(0)
-    obs, _ = particles()
-    weight = rng.normal(size=(E, D)).astype(np.float32)
-    variance = rng.uniform(0.5, 2, size=(E, D)).astype(np.float32)
-    fn = one_step_disagreement(affine)
-    got = fn((weight, variance), jnp.asarray(obs), jnp.ones(2), jnp.zeros((E, P, D)))
-    assert got.shape == (E, P)
-    means = np.float64(weight)[:, None, None] * np.float64(obs)[None] + 2.0
-    ratio = means.var(0) / np.float64(variance).mean(0)
-    want = np.sqrt(ratio).mean(-1)
+def test_ensemble_std_equals_the_reference():
+    states, _ = particles()
+    got = ensemble_std((), jnp.asarray(states), jnp.zeros(2), jnp.asarray(states))
+    assert got.shape == ()
+    want = np.float64(states).mean(1).std(0).sum()
     np.testing.assert_allclose(got, want, rtol=1e-5)
+    ones = np.ones(D, np.float32)
+    np.testing.assert_allclose(got, D * reward(states, ones), rtol=1e-5)
 
 
-def test_one_step_disagreement_is_zero_for_members_that_agree():
-    obs, _ = particles()
-    same = (jnp.ones((E, D)), jnp.ones((E, D)))
-    got = one_step_disagreement(affine)(same, jnp.asarray(obs), jnp.ones(2), obs)
-    np.testing.assert_allclose(got, 0.0, atol=1e-5)
-
-
-def test_one_step_disagreement_with_the_ensemble(key):
-    model = toys.small_ensemble()
-    params = jax.jit(model.init)(key)
-    fn = jax.jit(one_step_disagreement(model.predict))
-    obs = jax.random.normal(key, (3, 2, 2))
-    got = fn(params, obs, jnp.ones(1), obs)
-    # All six particles as the rows of every member.
-    rows = jnp.broadcast_to(obs.reshape(6, 2), (3, 6, 2))
-    mean, variance = (
-        np.float64(x) for x in jax.jit(model.predict)(params, rows, jnp.ones((6, 1)))
-    )
-    want = np.sqrt(mean.var(0) / variance.mean(0)).mean(-1)
-    np.testing.assert_allclose(got, want.reshape(3, 2), rtol=1e-4)
-
-
-def test_one_step_disagreement_refuses_what_does_not_fit():
-    fn = one_step_disagreement(affine)
-    params = (jnp.ones((1, D)), jnp.ones((1, D)))
+def test_ensemble_std_refuses_what_does_not_fit():
+    states, _ = particles()
     with pytest.raises(ValueError, match="at least 2 members, got 1"):
-        fn(params, jnp.zeros((1, P, D)), jnp.ones(2), jnp.zeros((1, P, D)))
-    with pytest.raises(ValueError, match=r"obs must be float32\[E, P, D\], got"):
-        fn(params, jnp.zeros((P, D)), jnp.ones(2), jnp.zeros((P, D)))
+        ensemble_std((), states[:1], jnp.zeros(2), states[:1])
 
 
 # -- pessimism -------------------------------------------------------------------------
@@ -235,6 +199,39 @@ def test_pessimistic_refuses_what_does_not_fit():
         pessimistic(epistemic, 1.0)(base, *step)
     with pytest.raises(ValueError, match="at least 2 members, got 1"):
         pessimistic(first, 1.0)(1.0, states[:1], jnp.zeros(2), states[:1])
+
+
+# -- mixture ---------------------------------------------------------------------------
+
+
+def whole(scale, obs, action, next_obs):
+    """The reward `first` of the whole set."""
+    return jnp.mean(first(scale, obs, action, next_obs))
+
+
+@pytest.mark.parametrize("task", [first, whole])
+@pytest.mark.parametrize("novelty", [epistemic, first])
+def test_a_mixture_is_the_weighted_sum(task, novelty):
+    """As a plan sees it, whichever of the two has reduced the particles."""
+    states, base = particles()
+    step = (jnp.zeros((E, P, D)), jnp.ones(2), jnp.asarray(states))
+    data = jnp.asarray(base) if novelty is epistemic else jnp.float32(2)
+    params = MixtureData(jnp.float32(3), data, jnp.float32(0.25))
+    got = mixture(task, novelty)(params, *step)
+    assert got.shape == (() if (task, novelty) == (whole, epistemic) else (E, P))
+    want = np.mean(task(3, *step)) + 0.25 * np.mean(novelty(data, *step))
+    np.testing.assert_allclose(np.mean(got), want, rtol=1e-5)
+
+
+def test_a_mixture_refuses_what_does_not_fit():
+    with pytest.raises(TypeError, match="intrinsic_fn must be a function, got"):
+        mixture(first, 0.1)
+    states, base = particles()
+    step = (jnp.asarray(states), jnp.zeros(2), jnp.asarray(states))
+    with pytest.raises(TypeError, match="params must be a MixtureData, got tuple"):
+        mixture(first, epistemic)((1.0, base), *step)
+    with pytest.raises(ValueError, match=r"params.weight must be float32\[\], got"):
+        mixture(first, epistemic)(MixtureData(1.0, base, jnp.ones(2)), *step)
 
 
 def test_namespace_lists_what_it_has():

@@ -81,12 +81,17 @@ def test_no_key_is_used_twice():
     assert out.actions.shape == (HORIZON, 1)
 
 
-def test_candidates_must_divide():
-    search = jaxpets.optimizers.sharded(toys.optimizer("cem", HORIZON), "device")
-    planner = jaxpets.plan(NOISY, toys.reach, search)
-    words = r"num_samples must be a multiple of .* axis 'device' \(5\), got 64\."
-    with pytest.raises(ValueError, match=words):
-        over_axis(planner, cart_obs(0), size=5)
+@pytest.mark.parametrize("name", ["cem", "icem", "icem-loop"])
+def test_candidates_need_not_divide(name):
+    """64 on 5 devices, and those of iCEM, which keeps elites and tries the mean."""
+    search = toys.optimizer(name, HORIZON)
+    planner = jaxpets.plan(
+        EXACT, toys.reach, jaxpets.optimizers.sharded(search, "device")
+    )
+    alone = jaxpets.plan(EXACT, toys.reach, search)
+    want = jax.jit(alone.step)(PARAMS, key_of(0), alone.init(), cart_obs(1))
+    got = over_axis(planner, cart_obs(1), size=5)
+    toys.assert_trees_close(got, want, **CLOSE)
 
 
 def test_the_axis_must_be_there():

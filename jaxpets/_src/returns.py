@@ -1,0 +1,123 @@
+"""What an imagined candidate is worth: its rewards, until it ends, as one number."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.checks import check_array, check_callable, check_scalar
+from jaxpets._src.types import RewardFn
+
+# `(params, path [H+1, E, N, P, D], actions [H, N, A]) -> [N]`: in the order of time.
+ReturnsFn = Callable[[Any, Array, Array], Array]
+
+
+def checked_reward(reward_fn: RewardFn) -> RewardFn:
+    """Returns reward_fn with a check, when traced, of what it returns."""
+    check_callable("reward_fn", reward_fn)
+
+    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        particles = obs.shape[:-1]
+        reward = reward_fn(params, obs, action, next_obs)
+        if not hasattr(reward, "dtype") and not isinstance(reward, (int, float)):
+            kind = type(reward).__name__
+            raise TypeError(f"reward_fn must return an array, got {kind}.")
+        reward = jnp.asarray(reward)
+        if reward.dtype != jnp.float32:
+            raise TypeError(f"reward_fn must return float32, got {reward.dtype}.")
+        if reward.shape not in ((), particles):
+            raise ValueError(
+                f"reward_fn must return shape () or {particles}, got {reward.shape}."
+            )
+        return reward
+
+    return reward
+
+
+def candidate_returns(
+    reward_fn: RewardFn,
+    terminal_fn: Callable[[Any, Array], Array] | None,
+    discount: float | Array,
+    risk_fn: Callable[[Array], Array] | None,
+) -> ReturnsFn:
+    """Builds the values of candidates from their paths; see `plan` for the arguments.
+
+    Without an end, a discount and a risk the particles of a step are averaged at once,
+    and no reward of a particle is kept.
+    """
+    reward = checked_reward(reward_fn)
+    check_scalar("discount", discount, 0.0, 1.0)
+    undiscounted = not isinstance(discount, Array) and discount == 1
+    if terminal_fn is None and risk_fn is None and undiscounted:
+        return _mean_returns(reward)
+    if terminal_fn is not None:
+        check_callable("terminal_fn", terminal_fn)
+    risk = jnp.mean if risk_fn is None else _checked_risk(risk_fn)
+
+    def every(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        # A set that is already reduced is worth the same to each of its particles.
+        step = reward(params, obs, action, next_obs)
+        return jnp.broadcast_to(step, obs.shape[:-1])
+
+    def returns(params: Any, path: Array, actions: Array) -> Array:
+        rewards = _over_steps(every)(params, path[:-1], actions, path[1:])
+        if terminal_fn is not None:
+            alive = _alive(terminal_fn, params, path[1:])
+            rewards = jnp.where(alive, rewards, 0.0)
+        steps = jnp.arange(rewards.shape[0], dtype=jnp.float32)
+        weights = jnp.asarray(discount, jnp.float32) ** steps
+        return jax.vmap(risk)(jnp.sum(weights[:, None, None, None] * rewards, axis=0))
+
+    return returns
+
+
+def _over_steps(reward_fn: RewardFn) -> Callable[[Any, Array, Array, Array], Array]:
+    """Maps a reward over candidates, then over time: the first two axes returned."""
+    candidates = jax.vmap(reward_fn, (None, 1, 0, 1))
+    return jax.vmap(candidates, (None, 0, 0, 0))
+
+
+def _mean_returns(reward_fn: RewardFn) -> ReturnsFn:
+    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        return jnp.mean(reward_fn(params, obs, action, next_obs))
+
+    rewards = _over_steps(reward)
+
+    def returns(params: Any, path: Array, actions: Array) -> Array:
+        return rewards(params, path[:-1], actions, path[1:]).sum(0)
+
+    return returns
+
+
+def _alive(
+    terminal_fn: Callable[[Any, Array], Array], params: Any, next_obs: Array
+) -> Array:
+    """Tells `[H, N, E, P]` which steps earn: those before which nothing has ended."""
+
+    def ended(params: Any, obs: Array) -> Array:
+        particles = obs.shape[:-1]
+        result = jnp.asarray(terminal_fn(params, obs))
+        if result.dtype != jnp.bool_ or result.shape not in ((), particles):
+            raise ValueError(
+                f"terminal_fn must return bool of shape () or {particles}, got "
+                f"{result.dtype}{list(result.shape)}."
+            )
+        return jnp.broadcast_to(result, particles)
+
+    ends = jax.vmap(jax.vmap(ended, (None, 1)), (None, 0))(params, next_obs)
+    ends = jax.lax.cummax(ends.astype(jnp.int32)) > 0
+    start = jnp.zeros((1, *ends.shape[1:]), bool)
+    return ~jnp.concatenate([start, ends[:-1]])
+
+
+def _checked_risk(risk_fn: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    check_callable("risk_fn", risk_fn)
+
+    def risk(returns: Array) -> Array:
+        value = risk_fn(returns)
+        check_array("risk_fn's result", value, [])
+        return value
+
+    return risk

@@ -1,0 +1,223 @@
+"""Any robot: an environment from an MJCF, its entries named and its space derived."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxpets._src.checks import check_array, check_count, check_key, check_real
+from jaxpets._src.coordinates import space
+from jaxpets._src.types import Env, EnvState
+from jaxpets.envs.engines import Engine, Physics, mjx_engine, native_engine
+from jaxpets.envs.extra import needs_extra
+from jaxpets.envs.observations import DEFAULT, Reading, readings
+
+with needs_extra():
+    import mujoco
+
+_C: Any = mujoco  # its names are made at import, where pyright does not see them
+_RESET_STD = 0.001  # as PETS starts HalfCheetah
+_STATE = ("mean_qvel", "qpos", "qvel")
+
+# `(key) -> (qpos [Q], qvel [V])`.
+ResetFn = Callable[[Array], tuple[Array, Array]]
+
+
+def mujoco_env(
+    model: Any,
+    *,
+    observe: Sequence[str] = DEFAULT,
+    control_step: float = 0.05,
+    action_repeat: int = 1,
+    reset: ResetFn | Sequence[str] | None = None,
+    backend: str = "mujoco",
+    num_threads: int | None = None,
+) -> Env:
+    """Builds an environment from a MuJoCo model.
+
+    The coordinates of the model that is learned follow from the joints; they are in
+    `Env.coordinates`, and `jaxpets.coordinates.space` makes a ModelSpace of them:
+
+      env = mujoco_env("hopper.xml")
+      rows = env.coordinates
+      model = jaxpets.ensemble(config, coordinates.space(rows), obs_size=len(rows), ...)
+
+    What is not of positions and velocities alone (sensors, places, contacts) is of the
+    state that was reached and the action that led there.
+
+    Args:
+      model: a path to an MJCF, its text, or a compiled MuJoCo model.
+      observe: what is observed, by the names that `observations.readings` explains; by
+        default all joints, but not where the robot stands if nothing depends on it.
+      control_step: in s, a multiple of the model's time step.
+      action_repeat: for how many control steps an action is held; a step of the
+        environment takes as long.
+      reset: names of keyframes, of which a trial starts at one at random; or `(key) ->
+        (qpos [Q], qvel [V])`, whose quaternions are made unit; or None for the model's
+        own start. All but the function's are within 0.001 of what was named.
+      backend: "mujoco", C on the cores of the host, for up to a hundred environments;
+        or "mjx", JAX on the device, with the same physics in float32.
+      num_threads: of "mujoco", over which a batch is spread; by default all cores.
+
+    Returns:
+      An Env whose actions are in the units of the actuators, within their ranges.
+
+    Raises:
+      TypeError, ValueError: naming what cannot be: a model that does not compile or has
+        no actuator or one without a range, a name that is no entry, a time that is no
+        multiple, or what the backend lacks.
+      FileNotFoundError: if there is no such file.
+    """
+    model = load_model(model)
+    found = readings(model, observe)
+    coordinates = space([reading.coordinate for reading in found]).coordinates
+    low, high = _action_range(model)
+    num_substeps = _num_substeps(model, control_step, action_repeat)
+    places = [(r.source, r.place) for r in found if r.source not in _STATE]
+    if backend == "mujoco":
+        engine = native_engine(
+            model, num_substeps=num_substeps, places=places, num_threads=num_threads
+        )
+    elif backend == "mjx":
+        engine = mjx_engine(model, num_substeps=num_substeps, places=places)
+    else:
+        raise ValueError(f'backend must be "mujoco" or "mjx", got {backend!r}.')
+    start_fn = _start_fn(model, reset)
+    seen_fn = _seen_fn(model, found, engine, num_substeps * model.opt.timestep)
+
+    def begin(key: Array) -> EnvState:
+        check_key("key", key)
+        qpos, qvel = start_fn(key)
+        check_array("the qpos of reset", qpos, [model.nq])
+        check_array("the qvel of reset", qvel, [model.nv])
+        still = jnp.zeros((model.nv,), jnp.float32)
+        physics = Physics(_unit_quaternions(model, qpos), qvel, still)
+        return EnvState(seen_fn(physics, physics, jnp.zeros_like(low)), physics)
+
+    def step(state: EnvState, action: Array) -> EnvState:
+        check_array("action", action, [model.nu])
+        physics = engine.advance(state.physics, action)
+        return EnvState(seen_fn(state.physics, physics, action), physics)
+
+    return Env(begin, step, low, high, coordinates)
+
+
+def load_model(model: Any) -> Any:
+    """Returns a compiled MuJoCo model from a path, the text of an MJCF, or itself.
+
+    Raises:
+      TypeError, ValueError: if it is none of these, or does not compile.
+      FileNotFoundError: if there is no such file.
+    """
+    if isinstance(model, _C.MjModel):
+        return model
+    if not isinstance(model, (str, Path)):
+        kind = type(model).__name__
+        raise TypeError(f"model must be a path, MJCF or an MjModel, got {kind}.")
+    is_text = str(model).lstrip().startswith("<")
+    where = "this text" if is_text else str(model)
+    if not is_text and not Path(model).is_file():
+        raise FileNotFoundError(f"model must be a file or MJCF, but {where} is none.")
+    load = _C.MjModel.from_xml_string if is_text else _C.MjModel.from_xml_path
+    try:
+        return load(str(model))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"model must compile, but {where} does not: {reason}"
+        ) from error
+
+
+def _action_range(model: Any) -> tuple[Array, Array]:
+    """Returns the least and greatest control of every actuator, `[A]` both."""
+    if not model.nu:
+        raise ValueError("model must have an actuator, got none.")
+    for actuator in range(model.nu):
+        if not model.actuator_ctrllimited[actuator]:
+            name = model.actuator(actuator).name or f"actuator{actuator}"
+            raise ValueError(
+                f"every actuator must have a ctrlrange, but {name} has none."
+            )
+    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    return low, high
+
+
+def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:
+    check_real("control_step", control_step, 0.0)
+    check_count("action_repeat", action_repeat)
+    ratio = control_step / model.opt.timestep
+    count = max(1, round(ratio))
+    if abs(ratio - count) > 1e-6 * count:
+        near = count * model.opt.timestep
+        raise ValueError(
+            f"control_step must be a multiple of the model's {model.opt.timestep:g} s, "
+            f"as {near:g}, got {control_step!r}."
+        )
+    return count * action_repeat
+
+
+def _start_fn(model: Any, reset: ResetFn | Sequence[str] | None) -> ResetFn:
+    """Returns what draws the start of a trial."""
+    if callable(reset):
+        return reset
+    qpos, qvel = np.array([model.qpos0]), np.zeros((1, model.nv))
+    if reset is not None:
+        names = [model.key(i).name for i in range(model.nkey)]
+        unknown = [name for name in reset if name not in names]
+        if isinstance(reset, str) or not reset or unknown:
+            raise ValueError(f"reset must be keyframes among {names}, got {reset!r}.")
+        chosen = [names.index(name) for name in reset]
+        qpos, qvel = model.key_qpos[chosen], model.key_qvel[chosen]
+    all_qpos, all_qvel = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
+
+    def start(key: Array) -> tuple[Array, Array]:
+        qpos_key, qvel_key = jax.random.split(key)
+        one = 0
+        if len(all_qpos) > 1:
+            one = jax.random.randint(jax.random.fold_in(key, 0), (), 0, len(all_qpos))
+        noise = jax.random.normal(qpos_key, (model.nq,), jnp.float32)
+        speed = jax.random.normal(qvel_key, (model.nv,), jnp.float32)
+        return all_qpos[one] + _RESET_STD * noise, all_qvel[one] + _RESET_STD * speed
+
+    return start
+
+
+def _unit_quaternions(model: Any, qpos: Array) -> Array:
+    """Returns positions whose quaternions are unit."""
+    free, ball = int(_C.mjtJoint.mjJNT_FREE), int(_C.mjtJoint.mjJNT_BALL)
+    for kind, start in zip(model.jnt_type, model.jnt_qposadr, strict=True):
+        if kind in (free, ball):
+            first = int(start) + (3 if kind == free else 0)
+            part = qpos[first : first + 4]
+            qpos = qpos.at[first : first + 4].set(part / jnp.linalg.norm(part))
+    return qpos
+
+
+def _seen_fn(
+    model: Any, found: Sequence[Reading], engine: Engine, step_time: float
+) -> Callable[[Physics, Physics, Array], Array]:
+    """Returns `(physics before, physics, action) -> obs [D]`."""
+    starts = {"mean_qvel": 0, "qpos": model.nq, "qvel": 2 * model.nq}
+    end = 2 * model.nq + model.nv
+    places: list[int] = []
+    num_read = 0
+    for reading in found:
+        if reading.source in _STATE:
+            places.append(starts[reading.source] + reading.place)
+        else:
+            places.append(end + num_read)
+            num_read += 1
+    order = np.array(places)
+
+    def seen(before: Physics, physics: Physics, action: Array) -> Array:
+        mean_qvel = (physics.qpos - before.qpos) / step_time
+        parts = [mean_qvel, physics.qpos, physics.qvel]
+        if num_read:
+            parts.append(engine.read(physics, action))
+        return jnp.concatenate(parts)[order]
+
+    return seen

@@ -1,0 +1,192 @@
+"""Any robot: the environment that an MJCF means, on both engines."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import robots
+
+import jaxpets
+from jaxpets import coordinates
+from jaxpets.envs import half_cheetah as hc
+from jaxpets.envs import mujoco_env as module
+from jaxpets.envs.mujoco_env import mujoco_env
+from jaxpets.envs.observations import DEFAULT
+
+EVERYTHING = (
+    "mean_qvel/root.x", "qpos", "qvel", "sensordata", "site_xpos/foot.z", "xmat/leg.zz",
+    "subtree_linvel/torso.x", "xpos/arm",
+)  # fmt: skip
+KEYS = (
+    '<keyframe><key name="left" qpos="-3 0"/><key name="right" qpos="3 3.1" '
+    'qvel="1 0"/></keyframe></mujoco>'
+)
+CART = robots.CART_XML.replace("</mujoco>", KEYS)
+
+
+@pytest.fixture(scope="module")
+def free():
+    return mujoco_env(robots.FREE_XML, observe=EVERYTHING, control_step=0.02)
+
+
+def rolled(env, key, num_steps=30):
+    """Transitions of random actions, and the state behind the last."""
+
+    def step(state, key):
+        action = jax.random.uniform(key, env.action_low.shape, jnp.float32, -1.0, 1.0)
+        after = env.step(state, action)
+        return after, jaxpets.Transition(state.obs, action, after.obs)
+
+    start = env.reset(key)
+    keys = jax.random.split(key, num_steps)
+    return jax.jit(lambda *args: jax.lax.scan(step, *args))(start, keys)
+
+
+def test_the_cheetah_comes_out_of_its_model(key):
+    """Nothing said but the model: the environment of PETS, to the bit."""
+    got, want = mujoco_env(hc.load_model()), hc.half_cheetah_native()
+    assert got.coordinates == hc.model_space().coordinates
+    for a, b in zip(rolled(got, key), rolled(want, key), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, a, b)
+    np.testing.assert_array_equal(got.action_low, want.action_low)
+
+
+def test_readings_are_those_of_mujoco_in_the_state_that_was_reached(free, key):
+    model = mujoco.MjModel.from_xml_string(robots.FREE_XML)
+    data = mujoco.MjData(model)
+    state, action = free.reset(key), jnp.full((1,), 0.7)
+    for _ in range(40):  # until it stands on its foot
+        before, state = state, free.step(state, action)
+    data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
+    data.qacc_warmstart[:] = state.physics.qacc_warmstart
+    data.ctrl[:] = action
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    found = dict(zip([c.name for c in free.coordinates], state.obs, strict=True))
+    moved = (state.physics.qpos[0] - before.physics.qpos[0]) / 0.02
+    want = {
+        "mean_qvel/root.x": moved,
+        "qpos/hip": data.joint("hip").qpos[0],
+        "qvel/root.wz": data.joint("root").qvel[5],
+        "sensordata/drift.y": data.sensor("drift").data[1],
+        "site_xpos/foot.z": data.site("foot").xpos[2],
+        "xmat/leg.zz": data.body("leg").xmat[8],
+        "subtree_linvel/torso.x": data.subtree_linvel[model.body("torso").id][0],
+        "xpos/arm.y": data.body("arm").xpos[1],
+        "sensordata/sole": data.sensor("sole").data[0],
+    }
+    for name, value in want.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5, atol=1e-6)
+
+
+def test_a_model_can_be_learned_in_its_coordinates(free, key):
+    _, data = rolled(free, key)
+    space = coordinates.space(free.coordinates)
+    jaxpets.check_space(space, data.obs, data.next_obs)
+    assert data.obs.shape == (30, len(free.coordinates))
+
+
+def test_one_step_on_mjx_is_that_of_c(key):
+    observe = (*DEFAULT, "site_xpos/tip", "subtree_linvel/cart.x")
+    native, mjx = (
+        mujoco_env(CART, observe=observe, control_step=0.01, backend=backend)
+        for backend in ("mujoco", "mjx")
+    )
+    start, action = native.reset(key), jnp.full((1,), 0.5)
+    got, want = (jax.jit(env.step)(start, action) for env in (mjx, native))
+    # Five substeps in float32, without contacts.
+    np.testing.assert_allclose(got.obs, want.obs, rtol=1e-4, atol=1e-5)
+    assert native.coordinates == mjx.coordinates and want.obs.shape == (8,)
+
+
+def test_an_action_is_held_for_its_repeats(key):
+    once = mujoco_env(CART, control_step=0.02, observe=["mean_qvel/slider", "qpos"])
+    thrice = mujoco_env(
+        CART, control_step=0.02, action_repeat=3, observe=["mean_qvel/slider", "qpos"]
+    )
+    action = jnp.ones(1)
+    state = first = once.reset(key)
+    for _ in range(3):
+        state = once.step(state, action)
+    held = thrice.step(first, action)
+    # Steps of the environment round to float32 in between.
+    np.testing.assert_allclose(held.obs[1:], state.obs[1:], rtol=1e-5)
+    moved = (held.physics.qpos[0] - first.physics.qpos[0]) / 0.06
+    np.testing.assert_allclose(held.obs[0], moved, rtol=1e-5)
+
+
+def test_trials_start_where_they_are_told(key):
+    keys = jax.random.split(key, 40)
+    env = mujoco_env(CART, reset=("left", "right"))
+    both = jax.jit(jax.vmap(env.reset))(keys).physics
+    sides = np.sign(both.qpos[:, 0])
+    assert 5 < (sides > 0).sum() < 35
+    np.testing.assert_allclose(both.qpos[:, 0], 3 * sides, atol=0.01)
+    np.testing.assert_allclose(both.qvel[:, 0], sides > 0, atol=0.01)
+    one = mujoco_env(CART, reset=["left"]).reset(key)
+    np.testing.assert_allclose(one.physics.qpos, [-3, 0], atol=0.01)
+
+    def own(key):
+        del key
+        qpos = jnp.full((12,), 2.0)
+        return qpos, jnp.arange(10, dtype=jnp.float32)
+
+    state = mujoco_env(robots.FREE_XML, reset=own).reset(key)
+    want = [2.0] * 3 + [0.5] * 4 + [2.0] + [0.5] * 4
+    np.testing.assert_allclose(state.physics.qpos, want)
+    np.testing.assert_array_equal(state.physics.qvel, np.arange(10))
+
+
+def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
+    path = tmp_path / "cart.xml"
+    path.write_text(CART)
+    model = mujoco.MjModel.from_xml_string(CART)
+    want = mujoco_env(CART).reset(key)
+    for given in (path, str(path), model):
+        jax.tree.map(np.testing.assert_array_equal, mujoco_env(given).reset(key), want)
+    assert module.load_model(model) is model
+
+
+NO_RANGE = CART.replace(' ctrlrange="-1 1"', "")
+BAD = {
+    "model must be a path, MJCF or an MjModel, got int": (3, {}),
+    "model must be a file or MJCF, but none.xml is none": ("none.xml", {}),
+    "model must compile, but this text does not: XML": ("<mujoco><x/>", {}),
+    "every actuator must have a ctrlrange, but push has none": (NO_RANGE, {}),
+    "every actuator must have a ctrlrange, but actuator0 has none": (
+        NO_RANGE.replace('name="push"', ""), {},
+    ),
+    "model must have an actuator, got none": (
+        robots.mjcf('<body><joint/><geom size="1"/></body>'), {},
+    ),
+    "control_step must be a multiple of the model's 0.002 s, as 0.004, got 0.003": (
+        CART, {"control_step": 0.003},
+    ),
+    "action_repeat must be at least 1": (CART, {"action_repeat": 0}),
+    "reset must be keyframes among ..left., .right.., got .'up',.": (
+        CART, {"reset": ("up",)},
+    ),
+    "reset must be keyframes .* got 'left'": (CART, {"reset": "left"}),
+    'backend must be "mujoco" or "mjx", got \'warp\'': (CART, {"backend": "warp"}),
+    "names of coordinates must differ": (CART, {"observe": ["qpos", "qpos"]}),
+    "MJX lacks what this model uses": (
+        CART.replace("<worldbody>", '<option solver="PGS"/><worldbody>'),
+        {"backend": "mjx"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_what_cannot_be_is_said(message):
+    model, options = BAD[message]
+    with pytest.raises((TypeError, ValueError, FileNotFoundError), match=message):
+        mujoco_env(model, **options)
+
+
+def test_a_start_of_the_wrong_size_is_refused(key):
+    env = mujoco_env(CART, reset=lambda key: (jnp.zeros(3), jnp.zeros(2)))
+    with pytest.raises(ValueError, match=r"the qpos of reset must be float32\[2\]"):
+        env.reset(key)
+    with pytest.raises(ValueError, match=r"action must be float32\[1\]"):
+        env.step(mujoco_env(CART).reset(key), jnp.zeros(2))
