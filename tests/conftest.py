@@ -3,6 +3,7 @@
 import atexit
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -40,8 +41,12 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keeps pytest-xdist from sorting files by their number of tests."""
+    """Keeps pytest-xdist from sorting files by their number of tests.
+
+    Processes that tests stop by a SIGHUP get it also where the tests run under nohup.
+    """
     config.option.loadscopereorder = False
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
