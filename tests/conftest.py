@@ -43,10 +43,13 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 def pytest_configure(config: pytest.Config) -> None:
     """Keeps pytest-xdist from sorting files by their number of tests.
 
-    Processes that tests stop by a SIGHUP get it also where the tests run under nohup.
+    Processes that tests stop by a signal get it also where the tests run under nohup,
+    or in the background of a script.
     """
     config.option.loadscopereorder = False
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
