@@ -3,6 +3,7 @@
 Every message names the argument, what was wanted and what came.
 """
 
+import difflib
 import math
 from collections.abc import Sequence
 from typing import Any, TypeGuard, cast
@@ -65,6 +66,11 @@ def check_scalar(name: str, value: Any, low: float, high: float = math.inf) -> N
             return
         value = float(value)
     check_real(name, value, low, high)
+
+
+def nearest(name: Any, names: Sequence[str]) -> list[str]:
+    """Returns the up to three names that are most like what was given, if any is."""
+    return difflib.get_close_matches(str(name), names, n=3, cutoff=0.4)
 
 
 def check_reals(name: str, values: Any, low: float) -> None:

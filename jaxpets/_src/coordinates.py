@@ -1,6 +1,5 @@
 """Coordinates as data: a table of an observation's entries, and the space it means."""
 
-import difflib
 import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_flag, check_record
+from jaxpets._src.checks import check_flag, check_record, nearest
 from jaxpets._src.types import Coordinate, ModelSpace
 
 KINDS = ("relative", "absolute", "angle", "quaternion")
@@ -87,8 +86,8 @@ def index(coordinates: Sequence[Coordinate], name: str) -> int:
     names = [row.name for row in coordinates]
     if name in names:
         return names.index(name)
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names
-    raise ValueError(f"name must be an entry, as {', '.join(near)}, got {name!r}.")
+    near = ", ".join(nearest(name, names) or names)
+    raise ValueError(f"name must be an entry, as {near}, got {name!r}.")
 
 
 def table(coordinates: Sequence[Coordinate]) -> str:
@@ -179,9 +178,8 @@ def _read(block: _Block, obs: Array) -> list[Array]:
     if block.kind == "plain":
         return [entry]
     w, x, y, z = jnp.split(entry, _QUATERNION_SIZE, axis=-1)
-    one = 1.0
-    forward = [one - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
-    left = [2 * (x * y - w * z), one - 2 * (x * x + z * z), 2 * (y * z + w * x)]
+    forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    left = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
     return forward + left
 
 

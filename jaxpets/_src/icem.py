@@ -143,8 +143,9 @@ def icem(
         elites = select_elites(values, actions, num_elites)
         mean = box.clip(momentum * found.mean + (1 - momentum) * elites.mean)
         std = momentum * found.std + (1 - momentum) * jnp.sqrt(elites.variance)
-        kept, best = elites.actions[:num_kept], elites.actions[0]
-        return _Found(mean, std, kept, best, elites.value)
+        return _Found(
+            mean, std, elites.actions[:num_kept], elites.actions[0], elites.value
+        )
 
     def loop(
         objective_fn: ObjectiveFn, keys: Array, found: _Found
@@ -154,13 +155,12 @@ def icem(
         def iterate(found: _Found, inputs: tuple[Array, ...]) -> tuple[_Found, Any]:
             keys, population, is_last = inputs
             tried = evaluate(objective_fn, keys, found, num_samples, True)
-            is_surplus = (row >= population) & (row < num_samples)
-            is_surplus |= (row == row[-1]) & ~is_last
+            is_spare = (row >= population) & (row < num_samples)
+            is_spare |= (row == row[-1]) & ~is_last
             # Below the worst value: there are always enough others to be elites.
-            values = jnp.where(is_surplus, -jnp.inf, tried.values)
-            return improve(
-                found, tried.actions, values
-            ), tried if keep_candidates else ()
+            values = jnp.where(is_spare, -jnp.inf, tried.values)
+            better = improve(found, tried.actions, values)
+            return better, (tried if keep_candidates else ())
 
         is_last = jnp.arange(num_iterations) == num_iterations - 1
         inputs = (keys, jnp.array(populations, jnp.int32), is_last)

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -100,20 +100,12 @@ def mjx_engine(
 
     def advance(before: Physics, action: Array) -> Physics:
         data = data_of(before, action)
-        # GPUs multiply in TF32 by default: an error 400 times that of float32. And MJX
-        # does not trace under strict promotion, which a caller may have set.
-        with (
-            jax.default_matmul_precision("highest"),
-            jax.numpy_dtype_promotion("standard"),
-        ):
+        with _as_mjx_needs():
             data = cast(Any, jax.lax.fori_loop(0, num_substeps, substep, data))
         return Physics(data.qpos, data.qvel, data.qacc_warmstart)
 
     def read(physics: Physics, action: Array) -> Array:
-        with (
-            jax.default_matmul_precision("highest"),
-            jax.numpy_dtype_promotion("standard"),
-        ):
+        with _as_mjx_needs():
             data = mjx_forward(device_model, data_of(physics, action))
             if any(source == "subtree_linvel" for source, _ in places):
                 data = subtree_vel(device_model, data)
@@ -121,6 +113,20 @@ def mjx_engine(
         return jnp.stack(numbers).astype(jnp.float32)
 
     return Engine(advance, read)
+
+
+@contextlib.contextmanager
+def _as_mjx_needs() -> Generator[None]:
+    """Traces MJX in float32, whatever a caller has set.
+
+    GPUs multiply in TF32 by default: an error 400 times that of float32. And MJX does
+    not trace under strict promotion.
+    """
+    with (
+        jax.default_matmul_precision("highest"),
+        jax.numpy_dtype_promotion("standard"),
+    ):
+        yield
 
 
 def _field(data: Any, name: str) -> Array:

@@ -1,9 +1,9 @@
 """Entries of an observation by their names in MuJoCo, and how a model sees each."""
 
-import difflib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from jaxpets._src.checks import nearest
 from jaxpets._src.types import Coordinate
 from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.symmetry import free_shifts
@@ -93,10 +93,8 @@ def _chosen(groups: dict[str, list[Reading]], name: str) -> list[Reading]:
     known = list(
         dict.fromkeys([*groups, *known, *(n.rpartition(".")[0] for n in known)])
     )
-    near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.4) or list(groups)
-    raise ValueError(
-        f"observe must have names of the model, as {', '.join(near)}, got {name!r}."
-    )
+    near = ", ".join(nearest(name, known) or groups)
+    raise ValueError(f"observe must have names of the model, as {near}, got {name!r}.")
 
 
 def _groups(model: Any, shifts: set[int]) -> dict[str, list[Reading]]:
