@@ -175,10 +175,11 @@ def _start_fn(model: Any, reset: ResetFn | Sequence[str] | None) -> ResetFn:
     all_qpos, all_qvel = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
 
     def start(key: Array) -> tuple[Array, Array]:
-        qpos_key, qvel_key = jax.random.split(key)
-        one = 0
+        one: Any = 0
         if len(all_qpos) > 1:
-            one = jax.random.randint(jax.random.fold_in(key, 0), (), 0, len(all_qpos))
+            key, one_key = jax.random.split(key)
+            one = jax.random.randint(one_key, (), 0, len(all_qpos))
+        qpos_key, qvel_key = jax.random.split(key)
         noise = jax.random.normal(qpos_key, (model.nq,), jnp.float32)
         speed = jax.random.normal(qvel_key, (model.nv,), jnp.float32)
         return all_qpos[one] + _RESET_STD * noise, all_qvel[one] + _RESET_STD * speed
