@@ -99,10 +99,13 @@ class EnvState(NamedTuple):
     Attributes:
       obs: `[D]` float32.
       physics: whatever the simulator needs to go on; any pytree.
+      constants: what was drawn for this trial and stays, as the place of a target, for
+        rewards to read; any pytree, () where there is nothing.
     """
 
     obs: Array
     physics: Any
+    constants: Any = ()
 
 
 class DynamicsFn(Protocol):

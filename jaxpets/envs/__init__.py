@@ -1,5 +1,16 @@
 """Environments; these modules need the extra `jaxpets[envs]`."""
 
 from jaxpets.envs.adapters import env_rollout, from_brax
+from jaxpets.envs.named import make, names
+from jaxpets.envs.robot import Robot, Tasks, tasks_of, with_constants
 
-__all__ = ["env_rollout", "from_brax"]
+__all__ = [
+    "Robot",
+    "Tasks",
+    "env_rollout",
+    "from_brax",
+    "make",
+    "names",
+    "tasks_of",
+    "with_constants",
+]

@@ -1,0 +1,113 @@
+"""A robot with what can be asked of it: environment, model coordinates and tasks."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.types import Env, ModelSpace, RewardFn
+
+
+class Tasks(NamedTuple):
+    """Tasks of one robot, as one reward with data, so that `jax.vmap` maps over them.
+
+    Attributes:
+      names: K of them.
+      reward_fn: the reward of every task, a RewardFn that also scores recorded trials,
+        `[..., D]` and `[..., A]`. Its params are one row of `params`, or, where trials
+        have constants, see `with_constants`.
+      params: a pytree of arrays `[K, ...]`.
+    """
+
+    names: tuple[str, ...]
+    reward_fn: RewardFn
+    params: Any
+
+
+class TrialParams(NamedTuple):
+    """What a task's reward reads in a trial that has constants.
+
+    Attributes:
+      task: one row of `Tasks.params`.
+      constants: `EnvState.constants`.
+    """
+
+    task: Any
+    constants: Any
+
+
+class Axis(NamedTuple):
+    """A quantity that shows where exploration went.
+
+    Attributes:
+      name: as `velocity`.
+      unit: as `m/s`.
+      entry: its place in the observation.
+      edges: of the bins of a histogram, increasing; the outermost bins are open.
+    """
+
+    name: str
+    unit: str
+    entry: int
+    edges: tuple[float, ...]
+
+
+class Robot(NamedTuple):
+    """A named environment and what goes with it.
+
+    Attributes:
+      name: as `envs.make` takes it.
+      env: the environment.
+      space: coordinates in which a model sees its observations.
+      tasks: what it may perform.
+      axes: two quantities by which exploration is shown.
+      angle: the entry, unwrapped and in rad, of which net turns are counted, if any.
+      model: the compiled MuJoCo model to draw it with, or None.
+      qpos_fn: `(obs [T, D]) -> [T, Q]`, positions of a recorded trial to draw, or None.
+    """
+
+    name: str
+    env: Env
+    space: ModelSpace
+    tasks: Tasks
+    axes: tuple[Axis, Axis]
+    angle: int | None = None
+    model: Any = None
+    qpos_fn: Callable[[Array], Array] | None = None
+
+
+def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:
+    """Returns tasks from a function each.
+
+    Every call computes all of them and picks one, so that a search for any of them is
+    the same program.
+
+    Args:
+      rewards: by name, `(constants, obs, action, next_obs) -> reward`, with the
+        constants of the trial, or ().
+
+    Raises:
+      ValueError: if there is none.
+    """
+    if not rewards:
+        raise ValueError("rewards must have a task, got none.")
+    names = tuple(rewards)
+
+    def reward_fn(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        chosen, constants = params, ()
+        if isinstance(params, TrialParams):
+            chosen, constants = params
+        reward = jnp.zeros((), jnp.float32)
+        for i, name in enumerate(names):
+            own = rewards[name](constants, obs, action, next_obs)
+            reward = jnp.where(chosen == i, own, reward)
+        return reward
+
+    return Tasks(names, reward_fn, jnp.arange(len(names), dtype=jnp.int32))
+
+
+def with_constants(params: Any, constants: Any) -> Any:
+    """Returns a task's params for one trial: with its constants, where it has any."""
+    has_none = isinstance(constants, tuple) and not constants
+    return params if has_none else TrialParams(params, constants)
