@@ -7,6 +7,7 @@ saved that is a kill, which loses nothing.
 """
 
 import contextlib
+import logging
 import os
 import signal
 import socket
@@ -74,13 +75,14 @@ def first_signal(act: Callable[[int], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def unheard() -> Iterator[None]:
-    """Keeps Python from printing tracebacks of what gets nowhere and means nothing.
+    """Keeps tracebacks from being shown of what gets nowhere and means nothing.
 
     InterruptedRun in callbacks, as those of its garbage collector: the deadline still
-    holds. And what TensorStore's threads come upon when a save has failed before they
-    were done: the save has said why.
+    holds. And what the threads of orbax and TensorStore come upon when a save has
+    failed before they were done, which they log: the save has said why.
     """
-    before = sys.unraisablehook
+    before, logger = sys.unraisablehook, logging.getLogger("absl")
+    level = logger.level
 
     def hook(unraisable: Any) -> None:
         late = str(unraisable.exc_value) == "Event loop is closed"
@@ -88,9 +90,11 @@ def unheard() -> Iterator[None]:
             before(unraisable)
 
     sys.unraisablehook = hook
+    logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
+        logger.setLevel(level)
         sys.unraisablehook = before
 
 

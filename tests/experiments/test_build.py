@@ -1,3 +1,5 @@
+from typing import get_args
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -5,6 +7,7 @@ import pytest
 import jaxpets
 from experiments import cli
 from experiments.build import build
+from experiments.config import ArmName
 from jaxpets.envs import half_cheetah
 
 
@@ -35,6 +38,19 @@ def test_what_plans_is_named(monkeypatch, rollout, flags, wanted):
     phase = ["--phase", "explore", "--preset", "smoke", "--arm", "random"]
     parts = build(cli.parse([*phase, *flags]))
     assert (parts.explored_by, parts.performed_by) == ("none", wanted)
+
+
+@pytest.mark.parametrize("arm", get_args(ArmName))
+def test_an_arm_plans_with_its_data(arm):
+    parts = build(cli.parse(["--phase", "explore", "--preset", "smoke", "--arm", arm]))
+    key, explorer = jax.random.key(0), parts.explorer
+    state = jax.eval_shape(parts.learner.init, key)
+    refresh = parts.reward_data.refresh
+    after = jax.eval_shape(refresh, state.reward, state.params, state.dataset)
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state.reward)
+    params = jaxpets.PlanParams(state.params, state.reward)
+    plan, _ = jax.eval_shape(explorer.step, params, key, explorer.init(), jnp.zeros(18))
+    assert plan.action.shape == (6,) and plan.value.shape == ()
 
 
 def test_pessimism_lowers_what_a_plan_is_worth():

@@ -1,6 +1,7 @@
 """How a run is stopped: by its first signal, in time, or else without it."""
 
 import asyncio
+import logging
 import os
 import signal
 import subprocess
@@ -132,6 +133,19 @@ def test_what_cannot_be_raised_is_not_printed(capsys):
     with signals.stoppable():
         Last()
     assert capsys.readouterr().err == ""
+
+
+def test_what_a_thread_of_a_failed_save_logs_later_is_not_shown(caplog):
+    def late():
+        logging.getLogger("absl").exception("the disk refused what nobody waits for")
+
+    with signals.unheard():
+        thread = threading.Thread(target=late)
+        thread.start()
+        thread.join()
+    assert caplog.text == ""
+    late()
+    assert "the disk refused" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,9 @@ static int kind = OFF, error_number, list = -1;
 static long at, count;
 
 /* Counts the operations on files below `folder` from now on. Each is a line in the file
-   `list_fd`, if that is not negative. Operation number `when`, from 1, meets its fault:
-   KILL ends the process, ONCE and FROM_THEN_ON fail with `number`. ENOSPC and EDQUOT
-   only meet what writes. */
+   `list_fd`, if that is not negative: whether it writes, number, name, path. Operation
+   number `when`, from 1, meets its fault: KILL ends the process, ONCE and FROM_THEN_ON
+   fail with `number`. ENOSPC and EDQUOT only meet what writes. */
 void fault_arm(const char *folder, int what, long when, int number, int list_fd) {
   snprintf(root, sizeof root, "%s", folder);
   kind = what, at = when, error_number = number, list = list_fd, count = 0;
@@ -60,7 +60,9 @@ static int fault(const char *name, int writes, int folder, const char *path) {
   int space = error_number == ENOSPC || error_number == EDQUOT;
   if (!writes && (kind == KILL || space)) return 0; /* as if it had not been */
   long number = __atomic_add_fetch(&count, 1, __ATOMIC_SEQ_CST);
-  if (list >= 0) dprintf(list, "%ld %s %s\n", number, name, whole + strlen(root));
+  if (list >= 0)
+    dprintf(list, "%s %ld %s %s\n", writes ? "write" : "read", number, name,
+            whole + strlen(root));
   if (kind == KILL && number == at) kill(getpid(), SIGKILL);
   int fails = (kind == ONCE && number == at) || (kind == FROM_THEN_ON && number >= at);
   if (fails) errno = error_number;
