@@ -36,21 +36,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="kinds whose name has this in it")
     parser.add_argument("--seconds", type=float, default=math.inf, help="time to spend")
+    parser.add_argument("--limit", type=float, default=300, help="s until one hangs")
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="faults-") as name:
         folder = Path(name).resolve()
-        with contextlib.closing(Bench(folder, args.jobs)) as bench:
-            outcomes = list(_all(bench, args))
+        with contextlib.closing(Bench(folder, args.jobs, limit=args.limit)) as bench:
+            outcomes = list(map(_told, _all(bench, args)))
         print(table(outcomes), flush=True)
         read = configs.damaged(args.configs, folder) if args.configs else {}
     print("\nDamaged configs:", ", ".join(f"{n} {what}" for what, n in read.items()))
-    lost = [outcome for outcome in outcomes if outcome.wrong]
-    for outcome in lost:
+    lost = sum(bool(outcome.wrong) for outcome in outcomes)
+    return lost + sum(n for what, n in read.items() if what not in configs.GOOD_ENDS)
+
+
+def _told(outcome: Outcome) -> Outcome:
+    """Says at once what was lost, should the bench itself be ended."""
+    if outcome.wrong:
         print(f"\n{outcome.wrong}: {outcome.fault}, exit {outcome.code}; it said:\n"
-              f"{outcome.said[-4000:]}", file=sys.stderr)  # fmt: skip
-    return len(lost) + sum(
-        n for what, n in read.items() if what not in configs.GOOD_ENDS
-    )
+              f"{outcome.said[-4000:]}", file=sys.stderr, flush=True)  # fmt: skip
+    return outcome
 
 
 def _all(bench: Bench, args: argparse.Namespace) -> Iterator[Outcome]:

@@ -25,7 +25,6 @@ from experiments.tools import digests
 HERE = Path(__file__).parent
 ROOT = Path(digests.__file__).parents[2]  # of the code that runs
 COUNT, KILL, ONCE, FROM_THEN_ON = 1, 2, 3, 4  # as in shim.c
-LIMIT = 300.0  # seconds until a run counts as hung
 # Exit codes that are promised: done, a checkpoint's, the disk's, interrupted.
 PROMISED = (0, 3, 5, 75)
 NAME = "smoke-random"  # of the run: exploring at random is the quickest
@@ -76,15 +75,16 @@ class Bench:
     """Reference runs, servers that fork runs, and a folder for all of it."""
 
     def __init__(
-        self, folder: Path, jobs: int, phases: Sequence[str] = tuple(PHASES)
-    ) -> None:
+        self, folder: Path, jobs: int, phases: Sequence[str] = tuple(PHASES),
+        limit: float = 300.0,
+    ) -> None:  # fmt: skip
         self._folder, self._jobs, self._phases = folder, jobs, phases
         shim = folder / "shim.so"
         flags = ["-std=c11", "-O1", "-shared", "-fPIC", "-o", shim, HERE / "shim.c"]
         subprocess.run(["cc", *map(str, flags), "-ldl"], check=True)
         self._servers: queue.Queue[Server] = queue.Queue()
         for _ in range(jobs):
-            self._servers.put(Server(shim, folder / "jax-cache"))
+            self._servers.put(Server(shim, folder / "jax-cache", limit))
         self.operations: dict[str, tuple[int, int]] = {}
         self.seconds: dict[str, float] = {}
         self.wanted: dict[str, dict[str, str]] = {}
@@ -203,7 +203,8 @@ class Bench:
 class Server:
     """A process that forks runs."""
 
-    def __init__(self, shim: Path, cache: Path) -> None:
+    def __init__(self, shim: Path, cache: Path, limit: float) -> None:
+        self._limit = limit  # seconds until a run counts as hung
         shared = os.environ.get("JAX_COMPILATION_CACHE_DIR")
         env = {
             "LD_PRELOAD": str(shim),
@@ -238,7 +239,7 @@ class Server:
             "listed": str(folder / "list") if fault.kind == "none" else None,
             "signal": fault.signal,
             "after": fault.after,
-            "limit": LIMIT,
+            "limit": self._limit,
         }
         assert self._process.stdin is not None and self._process.stdout is not None
         print(json.dumps(request), file=self._process.stdin, flush=True)
