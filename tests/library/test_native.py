@@ -1,4 +1,4 @@
-"""HalfCheetah on C MuJoCo: the same environment as on MJX, whatever surrounds it."""
+"""HalfCheetah on C MuJoCo: its physics to the bit, whatever surrounds it."""
 
 import dataclasses
 import os
@@ -68,24 +68,16 @@ def first(count, tree):
 # -- physics -------------------------------------------------------------------------
 
 
-def test_one_step_equals_mjx(states, actions, after):
-    mjx = jax.jit(jax.vmap(hc.half_cheetah().step))(states, actions)
-    error = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(-1), after, mjx)
-    print(jax.tree.map(lambda x: (np.median(x), x.max()), error))
-    # As for MJX against C: a rounding of an angle is 1e-7, a wrong contact 1e-1.
-    assert np.median(error.physics.qpos) < 1e-6
-    assert error.physics.qvel.max() < 1e-2
-    assert error.obs.max() < 1e-2
-    for half in (slice(0, STATES // 2), slice(STATES // 2, None)):
-        assert error.physics.qvel[half].max() > 0  # two engines, not one
-
-
 def test_one_step_is_that_of_c_rounded_once(model, states, actions, after):
     qpos, qvel, warmstart = (np.asarray(x) for x in states.physics)
     want, contacts = c_step(model, qpos, qvel, warmstart, np.asarray(actions))
     assert (contacts > 0).mean() > 0.5
     np.testing.assert_array_equal(after.physics.qpos, np.float32(want[0]))
     np.testing.assert_array_equal(after.physics.qvel, np.float32(want[1]))
+    velocity = (want[0][:, 0] - qpos[:, 0]) / hc.TIMESTEP
+    seen = np.concatenate([velocity[:, None], want[0][:, 1:], want[1]], axis=-1)
+    # The velocity is a difference of positions of up to 10 m that were rounded.
+    np.testing.assert_allclose(after.obs, seen, rtol=1e-5, atol=2e-5)
 
 
 def test_the_warm_start_goes_in_and_comes_out(states, actions):
