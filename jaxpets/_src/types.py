@@ -244,6 +244,10 @@ class Env(NamedTuple):
       action_low: `[A]`, finite.
       action_high: `[A]`, finite.
       coordinates: D entries of the observation; none where nobody has named them.
+      terminal_fn: `(obs [..., D]) -> bool [...]`, whether a trial has ended there, as a
+        robot that fell; the next step is from a new start. None: a trial ends by its
+        length alone. Imagination ends there if `plan` is told so, by
+        `terminal_fn=lambda params, obs: env.terminal_fn(obs)`.
     """
 
     reset: Callable[[Array], EnvState]
@@ -251,6 +255,7 @@ class Env(NamedTuple):
     action_low: Array
     action_high: Array
     coordinates: tuple[Coordinate, ...] = ()
+    terminal_fn: Callable[[Array], Array] | None = None
 
 
 class ModelSpace(NamedTuple):

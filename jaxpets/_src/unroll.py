@@ -81,7 +81,9 @@ def unroll(
     """Runs the planner in the environment for T = `length` steps.
 
     Step t uses the key `fold_in(key, t)` with t counted from the reset, so a trial
-    unrolled in parts with one key is the same trial.
+    unrolled in parts with one key is the same trial. Where `env.terminal_fn` says that
+    the trial has ended, environment and planner begin anew before they go on; no
+    transition leads from an end to a new start.
 
     Args:
       env: where to act.
@@ -112,6 +114,9 @@ def unroll(
         state: UnrollState, _: None
     ) -> tuple[UnrollState, tuple[Transition, PlanOutput]]:
         plan_key = jax.random.fold_in(key, state.step)
+        if env.terminal_fn is not None:
+            plan_key, reset_key = jax.random.split(plan_key)
+            state = _begun_anew(env, planner, reset_key, state)
         output, planner_state = planner.step(
             params, plan_key, state.planner, observe_fn(state.env)
         )
@@ -125,3 +130,20 @@ def unroll(
 
     state, (transitions, outputs) = jax.lax.scan(tick, state, None, length=length)
     return state, transitions, outputs
+
+
+def _begun_anew(
+    env: Env, planner: Planner, key: Array, state: UnrollState
+) -> UnrollState:
+    """Returns the state, or one of a new start if the trial has ended in it."""
+    assert env.terminal_fn is not None
+    ended = env.terminal_fn(state.env.obs)
+    if jnp.shape(ended) != () or jnp.result_type(ended) != jnp.bool_:
+        got = f"{jnp.result_type(ended)}{list(jnp.shape(ended))}"
+        raise ValueError(f"env.terminal_fn must return bool[], got {got}.")
+
+    def chosen(new: Array, old: Array) -> Array:
+        return jnp.where(ended, new, old)
+
+    fresh = UnrollState(reset(env, key), planner.init(), state.step)
+    return jax.tree.map(chosen, fresh, state)

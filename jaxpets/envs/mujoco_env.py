@@ -34,6 +34,7 @@ def mujoco_env(
     control_step: float = 0.05,
     action_repeat: int = 1,
     reset: ResetFn | Sequence[str] | None = None,
+    terminal_fn: Callable[[Array], Array] | None = None,
     backend: str = "mujoco",
     num_threads: int | None = None,
 ) -> Env:
@@ -59,6 +60,8 @@ def mujoco_env(
       reset: names of keyframes, of which a trial starts at one at random; or `(key) ->
         (qpos [Q], qvel [V])`, whose quaternions are made unit; or None for the model's
         own start. All but the function's are within 0.001 of what was named.
+      terminal_fn: `(obs [..., D]) -> bool [...]`, whether a trial ends there; None for
+        never.
       backend: "mujoco", C on the cores of the host, for up to a hundred environments;
         or "mjx", JAX on the device, with the same physics in float32.
       num_threads: of "mujoco", over which a batch is spread; by default all cores.
@@ -103,7 +106,7 @@ def mujoco_env(
         physics = engine.advance(state.physics, action)
         return EnvState(seen_fn(state.physics, physics, action), physics)
 
-    return Env(begin, step, low, high, coordinates)
+    return Env(begin, step, low, high, coordinates, terminal_fn)
 
 
 def load_model(model: Any) -> Any:

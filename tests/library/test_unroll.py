@@ -77,6 +77,55 @@ def test_random_actions_differ_between_steps_and_keys(key):
     assert len(np.unique(np.concatenate([first, other]))) == 16
 
 
+def is_far(obs):
+    return jnp.abs(obs[..., 0]) > 0.3
+
+
+def test_a_trial_that_has_ended_begins_anew(key):
+    """A cart that is driven to the right, and may not leave the middle."""
+    env = ENV._replace(terminal_fn=is_far)
+    planner = jaxpets.plan(
+        ROLLOUT, toys.reach, toys.optimizer("cem"),
+        terminal_fn=lambda params, obs: env.terminal_fn(obs),
+    )  # fmt: skip
+    params = PARAMS._replace(reward=jnp.float32(9.0))
+    begin = jaxpets.start_trial(env, planner, jax.random.key(1))
+
+    def trial(state, key, length):
+        return jaxpets.unroll(env, planner, params, key, state, length=length)
+
+    end, transitions, plans = jax.jit(trial, static_argnums=2)(begin, key, 24)
+    ends = np.asarray(is_far(transitions.next_obs))
+    assert 2 <= ends[:-1].sum() < 12 and end.step == 24
+    starts = np.append(True, ends[:-1])
+    joined = transitions.obs[1:] == transitions.next_obs[:-1]
+    np.testing.assert_array_equal(joined.all(-1), ~ends[:-1])
+    # A start is near 0, and each is another one; every transition obeys the cart.
+    assert (np.abs(transitions.obs[starts, 0]) < 0.3).all()
+    assert len(np.unique(transitions.obs[starts, 0])) == starts.sum()
+    moved = toys.cart(jnp.float32(1.0), None, transitions.obs, transitions.action)
+    np.testing.assert_allclose(transitions.next_obs, moved, rtol=1e-5, atol=1e-6)
+    # The planner begins anew as well: its first plan is that of a search begun there.
+    again = int(np.flatnonzero(starts)[1])
+    plan_key, _ = jax.random.split(jax.random.fold_in(key, again))
+    inputs = params, plan_key, planner.init(), transitions.obs[again]
+    first, _ = jax.jit(planner.step)(*inputs)
+    np.testing.assert_allclose(plans.actions[again], first.actions, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ends", "got"),
+    [(lambda obs: obs[..., 0], r"float32\[\]"), (lambda obs: obs > 0, r"bool\[2\]")],
+)
+def test_an_end_is_one_truth(key, ends, got):
+    env = ENV._replace(terminal_fn=ends)
+    begin = jaxpets.start_trial(env, CHANCE, jax.random.key(1))
+    with pytest.raises(
+        ValueError, match=rf"terminal_fn must return bool\[\], got {got}"
+    ):
+        jaxpets.unroll(env, CHANCE, PARAMS, key, begin, length=2)
+
+
 def test_bad_arguments_fail_when_traced(key):
     begin = jaxpets.start_trial(ENV, CHANCE, jax.random.key(1))
     with pytest.raises(ValueError, match="length must be at least 1, got 0"):
