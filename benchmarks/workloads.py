@@ -282,4 +282,7 @@ def candidates_per_action(size: Size, search: str) -> int:
 def rollout_flops(size: Size, num_candidates: int) -> float:
     """Returns the operations in the network's matrix products, two per multiply-add."""
     steps = num_candidates * size.num_particles * size.horizon
-    return model_flops(size.hidden_sizes) * steps
+    # Pitch is read as sine and cosine, and no finite-difference velocity.
+    read = half_cheetah.OBS_SIZE + half_cheetah.ACTION_SIZE
+    widths = (read, *size.hidden_sizes, 2 * half_cheetah.OBS_SIZE)
+    return model_flops(widths) * steps

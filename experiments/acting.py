@@ -6,16 +6,19 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from experiments.parallel import devices
 from experiments.parallel.devices import AXES, SEED, TASK, Placement
-from jaxpets.envs import half_cheetah
+from jaxpets.envs import Robot, with_constants
 
 # Called between chunks with the environment steps done; may raise to stop the run.
 Tick = Callable[[int], None]
+# `(reward data, constants of a trial) -> reward data` for that trial.
+Bind = Callable[[Any, Any], Any]
 
 
 class Actors(NamedTuple):
@@ -36,14 +39,27 @@ class Trials(NamedTuple):
 
     transitions: jaxpets.Transition  # [..., T, *]
     values: Array  # [..., T], predicted reward per imagined step
+    constants: Any = ()  # [...], as in an EnvState
+
+
+class Scorer(NamedTuple):
+    """What trials were worth.
+
+    names: of the K tasks.
+    score: `(transitions [..., T, *], constants [...]) -> (returns [..., K], turns)`,
+      with turns `[...]`, or None for a robot of which none are counted.
+    """
+
+    names: tuple[str, ...]
+    score: Callable[[jaxpets.Transition, Any], tuple[Array, Array | None]]
 
 
 def explorers(
     env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int,
-    placement: Placement,
+    placement: Placement, bind: Bind = lambda data, constants: data,
 ) -> Actors:  # fmt: skip
     """Returns actors over seeds `[S]`; params and reward data are per seed."""
-    start, chunk = _one(env, planner, horizon, length)
+    start, chunk = _one(env, planner, horizon, length, bind)
     params = jaxpets.PlanParams(P(SEED), P(SEED))
     return _actors(placement, jax.vmap(start), jax.vmap(chunk), params, SEED)
 
@@ -59,10 +75,10 @@ def evaluators(
 ) -> Actors:
     """Returns actors over seeds, tasks and trials `[S, K, R]`.
 
-    The task's weights are `[K]`. The model is `[S]` where all tasks share it, else
+    The task's params are `[K]`. The model is `[S]` where all tasks share it, else
     `[S, K]`.
     """
-    start, chunk = _one(env, planner, horizon, length)
+    start, chunk = _one(env, planner, horizon, length, with_constants)
     model = None if shared_model else 0
     over_trials = jax.vmap(chunk, (None, 0, 0))
     over_tasks = jax.vmap(over_trials, (jaxpets.PlanParams(model, 0), 0, 0))
@@ -98,10 +114,20 @@ def run(
     for _ in range(num_chunks):
         state, transitions, values = actors.chunk(params, act_keys, state)
         jax.block_until_ready(values)
-        chunks.append(Trials(transitions, values))
+        chunks.append((transitions, values))
         tick(values.shape[-1])
     time = keys.ndim
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=time), *chunks)
+    transitions, values = jax.tree.map(
+        lambda *parts: jnp.concatenate(parts, axis=time), *chunks
+    )
+    return Trials(transitions, values, state.env.constants)
+
+
+def constants(env: jaxpets.Env, keys: Array) -> Any:
+    """Returns what is drawn for the trials of these keys `[...]`, as `run` has it."""
+    reset_keys, _ = split_keys(keys)
+    drawn = jax.jit(jax.vmap(lambda key: env.reset(key).constants))(reset_keys.ravel())
+    return jax.tree.map(lambda x: x.reshape(*keys.shape, *x.shape[1:]), drawn)
 
 
 def split_keys(keys: Array) -> tuple[Array, Array]:
@@ -110,14 +136,35 @@ def split_keys(keys: Array) -> tuple[Array, Array]:
     return pairs[..., 0], pairs[..., 1]
 
 
-@jax.jit
-def score(transitions: jaxpets.Transition) -> tuple[Array, Array]:
-    """Returns the returns under the four tasks `[..., 4]` and the net turns `[...]`."""
-    reward_fn = jax.vmap(half_cheetah.task_reward, (0, None, None, None), -1)
-    rewards = reward_fn(half_cheetah.tasks(), *transitions)
-    pitch = transitions.next_obs[..., half_cheetah.PITCH]
-    turns = (pitch[..., -1] - pitch[..., 0]) / (2 * jnp.pi)
-    return jnp.sum(rewards, axis=-2), turns
+def scorer(robot: Robot) -> Scorer:
+    """Returns what scores trials of a robot; jitted once for all of a run."""
+    tasks, angle = robot.tasks, robot.angle
+    every = jax.tree.map(np.asarray, tasks.params)  # constants of the program
+
+    def score(
+        seen: jaxpets.Transition, constants: Any
+    ) -> tuple[Array, Array | None]:  # fmt: skip
+        def reward(task: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+            params = with_constants(task, constants)
+            return tasks.reward_fn(params, obs, action, next_obs)
+
+        rewards = jax.vmap(reward, (0, None, None, None), -1)(every, *seen)
+        returns = jnp.sum(rewards, axis=-2)
+        if angle is None:
+            return returns, None
+        path = seen.next_obs[..., angle]
+        return returns, (path[..., -1] - path[..., 0]) / (2 * jnp.pi)
+
+    def per_trial(
+        seen: jaxpets.Transition, constants: Any
+    ) -> tuple[Array, Array | None]:  # fmt: skip
+        program = score
+        if jax.tree.leaves(constants):
+            for _ in seen.obs.shape[:-2]:
+                program = jax.vmap(program)
+        return program(seen, constants)
+
+    return Scorer(tasks.names, jax.jit(per_trial))
 
 
 def _actors(
@@ -136,13 +183,14 @@ def _actors(
 
 
 def _one(
-    env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int
+    env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int, bind: Bind
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Returns `start` and `chunk` of one actor."""
 
     def chunk(
         params: jaxpets.PlanParams, key: Array, state: jaxpets.typing.UnrollState
     ) -> tuple[jaxpets.typing.UnrollState, jaxpets.Transition, Array]:
+        params = params._replace(reward=bind(params.reward, state.env.constants))
         state, transitions, plans = jaxpets.unroll(
             env, planner, params, key, state, length=length
         )

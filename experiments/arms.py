@@ -1,16 +1,19 @@
 """The arms: what phase 1 seeks. The first four are those of Table 1."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
 
 import jaxpets
+from experiments import user_files
+from experiments.acting import Bind
 from experiments.config import Config
 from jaxpets import rewards
-from jaxpets.envs import half_cheetah
+from jaxpets.envs import Robot, with_constants
 
 # States that an imagined one is compared with, as many as in a batch of APT; the time
 # of a plan grows with it.
@@ -23,46 +26,68 @@ _ONE_STEP: dict[str, Callable[..., jaxpets.typing.RewardFn]] = {
 
 
 class Arm(NamedTuple):
-    """An exploration reward and the data it needs, or a planner that has none."""
+    """An exploration reward and the data it needs, or a planner that has none.
+
+    `bind` gives the data the constants of a trial, where the reward reads them.
+    """
 
     reward_fn: jaxpets.typing.RewardFn | None  # None acts without a plan
     reward_data: jaxpets.RewardData = jaxpets.RewardData()
     planner: jaxpets.Planner | None = None  # without a reward: None acts at random
+    bind: Bind = lambda data, constants: data
 
 
-def make_arm(config: Config, model: jaxpets.Ensemble, env: jaxpets.Env) -> Arm:
+def make_arm(
+    config: Config,
+    model: jaxpets.Ensemble,
+    robot: Robot,
+    check: Callable[["Arm"], "Arm"] = lambda arm: arm,
+) -> Arm:
     """Returns the arm that a config names.
 
     Args:
       config: reads `arm`, `num_bits` and `trial_length`.
       model: predicts for the arms of one step.
-      env: has the actions of the arm that is noise.
+      robot: has the actions of the arm that is noise, and the task of those that seek
+        one.
+      check: of an arm of the user's; raises what is wrong with it.
+
+    Raises:
+      UsageError: if the arm is of a file of the user's, and that is at fault.
     """
+    if user_files.is_file(config.arm):
+
+        def own(found: Any) -> Arm:
+            return check(_own(found))
+
+        return user_files.made("--arm", config.arm, "", own, model)
     if config.arm == "pink-noise":
-        box = (env.action_low, env.action_high)
+        box = (robot.env.action_low, robot.env.action_high)
         length = max(config.trial_length, 2)
         noise = jaxpets.random_planner(*box, noise_beta=1.0, period=length)
         return Arm(None, planner=noise)
+    if config.arm == "oracle":
+        return _oracle(robot)
+    if config.arm == "mixture":
+        return _mixture(robot, _epistemic(config, model))
     return {
         "epistemic": _epistemic,
         "count": _count,
         "random": lambda config, model: Arm(None),
-        "oracle": _oracle,
         "info-gain": _info_gain,
         "best": _best,
         "ensemble-std": lambda config, model: Arm(rewards.ensemble_std),
         "rnd": _rnd,
         "particle-entropy": _particle_entropy,
-        "mixture": _mixture,
         **dict.fromkeys(_ONE_STEP, _one_step),
     }[config.arm](config, model)
 
 
 def _epistemic(config: Config, model: jaxpets.Ensemble) -> Arm:
     """SU-PETS: the paper's reward over w_base = exp(max_logvar), current and shared."""
-    del config, model
+    del config
     data = jaxpets.RewardData(
-        init=lambda key: jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32),
+        init=lambda key: jnp.ones((model.obs_size,), jnp.float32),
         refresh=lambda _, params, dataset: rewards.max_variance(params),
     )
     return Arm(rewards.epistemic, data)
@@ -70,9 +95,8 @@ def _epistemic(config: Config, model: jaxpets.Ensemble) -> Arm:
 
 def _count(config: Config, model: jaxpets.Ensemble) -> Arm:
     """#Exploration: one projection per seed, all states hashed anew after a trial."""
-    del model
-    size = half_cheetah.OBS_SIZE
-    nothing = jaxpets.datasets.init(1, size, half_cheetah.ACTION_SIZE)
+    size = model.obs_size
+    nothing = jaxpets.datasets.init(1, size, model.action_size)
 
     def init(key: Array) -> rewards.PseudoCounts:
         projection = rewards.simhash(key, config.num_bits, size)
@@ -87,14 +111,23 @@ def _count(config: Config, model: jaxpets.Ensemble) -> Arm:
     return Arm(rewards.pseudo_count, data)
 
 
-def _oracle(config: Config, model: jaxpets.Ensemble) -> Arm:
-    """PETS-oracle: the forward task in phase 1."""
-    del config, model
+def _own(found: Any) -> Arm:
+    """What a function of the user's returns for a model."""
+    is_pair = isinstance(found, tuple) and len(found) == 2
+    if not (
+        is_pair and callable(found[0]) and isinstance(found[1], jaxpets.RewardData)
+    ):
+        raise TypeError(f"it must return (RewardFn, RewardData), got {found!r}")
+    return Arm(*found)
+
+
+def _oracle(robot: Robot) -> Arm:
+    """PETS-oracle: the first task in phase 1, on HalfCheetah forward."""
     data = jaxpets.RewardData(
-        init=lambda key: half_cheetah.task("forward"),
-        refresh=lambda weights, params, dataset: weights,
+        init=lambda key: jax.tree.map(lambda x: x[0], robot.tasks.params),
+        refresh=lambda task, params, dataset: task,
     )
-    return Arm(half_cheetah.task_reward, data)
+    return Arm(robot.tasks.reward_fn, data, bind=with_constants)
 
 
 def _one_step(config: Config, model: jaxpets.Ensemble) -> Arm:
@@ -126,9 +159,9 @@ def _particle_entropy(config: Config, model: jaxpets.Ensemble) -> Arm:
     return Arm(rewards.particle_entropy(), data)
 
 
-def _mixture(config: Config, model: jaxpets.Ensemble) -> Arm:
-    """The forward task and disagreement, in equal parts: PETS that explores."""
-    task, novelty = _oracle(config, model), _epistemic(config, model)
+def _mixture(robot: Robot, novelty: Arm) -> Arm:
+    """The first task and disagreement, in equal parts: PETS that explores."""
+    task = _oracle(robot)
     assert task.reward_fn and novelty.reward_fn
 
     def init(key: Array) -> rewards.MixtureData:
@@ -144,8 +177,11 @@ def _mixture(config: Config, model: jaxpets.Ensemble) -> Arm:
         novel = novelty.reward_data.refresh(data.intrinsic, params, dataset)
         return data._replace(intrinsic=novel)
 
+    def bind(data: rewards.MixtureData, constants: Any) -> rewards.MixtureData:
+        return data._replace(extrinsic=with_constants(data.extrinsic, constants))
+
     mixed = rewards.mixture(task.reward_fn, novelty.reward_fn)
-    return Arm(mixed, jaxpets.RewardData(init, refresh))
+    return Arm(mixed, jaxpets.RewardData(init, refresh), bind=bind)
 
 
 def _best(config: Config, model: jaxpets.Ensemble) -> Arm:
@@ -155,9 +191,9 @@ def _best(config: Config, model: jaxpets.Ensemble) -> Arm:
     plan of SU-PETS apart from another is disagreement about the pitch, and exploration
     tumbles. In units of what was seen all coordinates weigh alike.
     """
-    del config, model
+    del config
     data = jaxpets.RewardData(
-        init=lambda key: jnp.ones((half_cheetah.OBS_SIZE,), jnp.float32),
+        init=lambda key: jnp.ones((model.obs_size,), jnp.float32),
         refresh=lambda _, params, dataset: jaxpets.datasets.obs_variance(dataset),
     )
     return Arm(rewards.epistemic, data)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +11,9 @@ import optax
 from jax import Array
 
 import jaxpets
-from experiments.arms import make_arm
+from experiments import robots
+from experiments.acting import Bind
+from experiments.arms import Arm, make_arm
 from experiments.config import (
     Config,
     ModelConfig,
@@ -19,7 +21,7 @@ from experiments.config import (
     TrainingConfig,
     part,
 )
-from jaxpets.envs import half_cheetah
+from jaxpets.envs import Robot
 
 State = jaxpets.LearnerState
 KERNEL, SCAN = "kernel", "scan"
@@ -28,22 +30,18 @@ Learn = Callable[[Array, State, Any], tuple[State, Any]]
 # Every phase draws from its own stream of keys.
 EXPLORE, ZERO_SHOT, FINETUNE, REFIT = 0, 1, 2, 3
 
-ENGINES = {
-    "mjx": half_cheetah.half_cheetah,
-    "mujoco": half_cheetah.half_cheetah_native,
-}
-
 
 class Parts(NamedTuple):
     """What the phases are made of. Nothing here is jitted."""
 
-    env: jaxpets.Env
+    robot: Robot
     model: jaxpets.Ensemble  # in the precision that trains
     random: jaxpets.Planner
     explorer: jaxpets.Planner  # phase 1
-    actor: jaxpets.Planner  # phase 2; reward data are the weights of a task
+    actor: jaxpets.Planner  # phase 2; reward data are the params of a task
     learner: jaxpets.Learner  # phase 1
     reward_data: jaxpets.RewardData  # of its reward
+    bind: Bind  # what gives them the constants of a trial
     explored_by: str  # what imagines in phase 1, as env.json has it
     performed_by: str  # and in phase 2
     refitter: jaxpets.Fitter | None  # between the phases
@@ -52,23 +50,23 @@ class Parts(NamedTuple):
 
 def build(config: Config) -> Parts:
     """Returns the parts for a validated config."""
-    env = ENGINES[config.engine]()
+    robot = robots.of(config)
+    env = robot.env
     size = ensemble_config(config.model)
-    trained = _ensemble(size, jaxpets.Precision.TF32)
-    planned = _ensemble(size, jaxpets.Precision(config.planner.precision))
-    arm = make_arm(config, planned, env)
+    trained = _ensemble(robot, size, jaxpets.Precision.TF32)
+    arm = make_arm(config, _planned(config, robot), robot)
     explored = config.num_trials * config.trial_length
     finetuned = config.finetune_trials * config.task_length
 
     def planner(
         reward_fn: jaxpets.typing.RewardFn, search: PlannerConfig
     ) -> tuple[jaxpets.Planner, str]:
-        rollout, kind = _rollout(size, search)
+        rollout, kind = _rollout(robot, size, search)
         unroll = kind.startswith(KERNEL) and jax.default_backend() == "gpu"
         search_fn = optimizer(search, env, unroll)
         return jaxpets.plan(rollout, reward_fn, search_fn), kind
 
-    reward = half_cheetah.task_reward
+    reward = robot.tasks.reward_fn
     if config.pessimism:
         reward = jaxpets.rewards.pessimistic(reward, config.pessimism)
     random = jaxpets.random_planner(env.action_low, env.action_high)
@@ -86,7 +84,7 @@ def build(config: Config) -> Parts:
         explorer, explored_by = planner(arm.reward_fn, config.planner)
     actor, performed_by = planner(reward, config.task_planner)
     return Parts(
-        env=env,
+        robot=robot,
         model=trained,
         random=random,
         explorer=explorer,
@@ -95,6 +93,7 @@ def build(config: Config) -> Parts:
             config.training, arm.reward_data, config.trial_length, explored
         ),
         reward_data=arm.reward_data,
+        bind=arm.bind,
         explored_by=explored_by,
         performed_by=performed_by,
         refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
@@ -107,6 +106,38 @@ def build(config: Config) -> Parts:
     )
 
 
+def check_arm(config: Config) -> None:
+    """Refuses an objective of the user's that no planner can seek.
+
+    Raises:
+      UsageError: with the line of the user's file that is at fault.
+    """
+    robot = robots.of(config)
+    model = _planned(config, robot)
+    count = config.model.num_members
+    rollout = jaxpets.particle_rollout(
+        model.sample, num_members=count, num_particles=count
+    )
+
+    def check(arm: Arm) -> Arm:
+        assert arm.reward_fn is not None
+        planner = jaxpets.plan(
+            rollout, arm.reward_fn, optimizer(config.planner, robot.env)
+        )
+
+        def plan(key: Array) -> Any:
+            params, data = model.init(key), arm.reward_data.init(key)
+            nothing = jaxpets.datasets.init(1, model.obs_size, model.action_size)
+            data = arm.reward_data.refresh(data, params, nothing)
+            known = jaxpets.PlanParams(params, data)
+            return planner.step(known, key, planner.init(), nothing.data.obs[0])
+
+        jax.eval_shape(plan, jax.random.key(0))
+        return arm
+
+    make_arm(config, model, robot, check)
+
+
 def trial_keys(config: Config, phase: int, trial: int) -> Array:
     """Returns one key per seed `[S]` for one trial of one phase."""
 
@@ -114,6 +145,15 @@ def trial_keys(config: Config, phase: int, trial: int) -> Array:
         return jax.random.fold_in(jax.random.fold_in(seed, phase), trial)
 
     return jax.vmap(one)(jnp.stack([jax.random.key(s) for s in config.seeds]))
+
+
+def key_per(ids: Sequence[int], keys: Array) -> Array:
+    """Derives keys `[..., K]` from keys `[...]`; a task has the same key in any set."""
+    data = jnp.asarray(list(ids), jnp.uint32)
+    fold = jax.vmap(jax.random.fold_in, (None, 0))
+    for _ in keys.shape:
+        fold = jax.vmap(fold, (0, None))
+    return fold(keys, data)
 
 
 def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
@@ -131,25 +171,32 @@ def _fitter(ensemble: jaxpets.Ensemble, training: TrainingConfig) -> jaxpets.Fit
 
 
 def _ensemble(
-    size: jaxpets.EnsembleConfig, precision: jaxpets.Precision
+    robot: Robot, size: jaxpets.EnsembleConfig, precision: jaxpets.Precision
 ) -> jaxpets.Ensemble:
+    obs_size, action_size = robots.sizes(robot)
     return jaxpets.ensemble(
         dataclasses.replace(size, precision=precision),
-        half_cheetah.model_space(),
-        obs_size=half_cheetah.OBS_SIZE,
-        action_size=half_cheetah.ACTION_SIZE,
+        robot.space,
+        obs_size=obs_size,
+        action_size=action_size,
     )
 
 
+def _planned(config: Config, robot: Robot) -> jaxpets.Ensemble:
+    """Returns the model in the precision that plans in phase 1."""
+    precision = jaxpets.Precision(config.planner.precision)
+    return _ensemble(robot, ensemble_config(config.model), precision)
+
+
 def _rollout(
-    size: jaxpets.EnsembleConfig, search: PlannerConfig
+    robot: Robot, size: jaxpets.EnsembleConfig, search: PlannerConfig
 ) -> tuple[jaxpets.typing.RolloutFn, str]:
     """Returns the rollout of a search, and what decides about its last bits.
 
     That is the compiler of a kernel, or the scan, with a reason if it was not wanted.
     """
     precision = jaxpets.Precision(search.precision)
-    model = _ensemble(size, precision)
+    model = _ensemble(robot, size, precision)
     may_have_kernel = {"cpu": True, "gpu": precision is jaxpets.Precision.BF16}
     if search.fused and may_have_kernel.get(jax.default_backend(), False):
         with warnings.catch_warnings():

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from experiments import flags
+from experiments import flags, robots, user_files
 from experiments.config import (
     Basics,
     Compute,
@@ -16,7 +16,7 @@ from experiments.config import (
     Science,
     part,
 )
-from experiments.entries import from_json
+from experiments.entries import flag, from_json
 from experiments.errors import CheckpointError, UsageError
 from experiments.parallel.distributed import ProcessSpec
 from experiments.presets import preset_config
@@ -52,6 +52,12 @@ def parse(argv: Sequence[str]) -> Config:
         check_explored(config, explored)
         _check_pretrained(config)
     validate(config)
+    if phase != "report":
+        robots.check_tasks(config, robots.of(config))
+        if user_files.is_file(config.arm):
+            from experiments import build
+
+            build.check_arm(config)
     return config
 
 
@@ -119,7 +125,8 @@ def _config(phase: Phase, argv: Sequence[str], default: Config) -> Config:
 
 def _source(config: Config) -> Path:
     """Returns a folder, or what comes with the code by the name `pretrained/NAME`."""
-    name = config.name or f"{config.preset}-{config.arm}"
+    study = rundir.study({"preset": config.preset, "env": config.env})
+    name = config.name or f"{study}-{rundir.label(config.arm)}"
     source = config.source or config.out / name
     if source.exists() or source.parts[:1] != ("pretrained",):
         return source
@@ -143,7 +150,18 @@ def _explored(config: Config) -> Config:
     # those that happen to be said again.
     own = from_json(data, config, str(path))
     explored = from_json(data, preset_config(own.preset, own.arm), str(path))
+    for entry in ("env", "arm"):
+        _check_said(entry, getattr(config, entry), getattr(explored, entry), path)
     return Config(**vars(part(explored, Science)), **vars(part(explored, Compute)))
+
+
+def _check_said(entry: str, said: str, found: str, where: Path) -> None:
+    """Refuses to run a file of which only the config of a run speaks."""
+    if user_files.is_file(found) and said != found:
+        raise UsageError(
+            f"{flag(entry)} {said} is not valid; {where} has {found}, which is a file "
+            f"and runs only if you name it: {flag(entry)} {found}."
+        )
 
 
 def _check_pretrained(config: Config) -> None:

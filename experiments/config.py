@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 from msgspec import Meta
 
+from experiments.storage.rundir import HALF_CHEETAH
 from jaxpets import EnsembleConfig, FitConfig
 
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
@@ -38,8 +39,15 @@ UNPLANNED = {"random": "random", "pink-noise": "noise"}
 # Arms that one network will do for.
 UNDIVIDED = (*UNPLANNED, "count", "oracle", "rnd", "particle-entropy")
 EngineName = Literal["mjx", "mujoco"]
-TaskName = Literal["all", "forward", "backward", "front-flip", "back-flip"]
-NUM_TASKS = len(get_args(TaskName)) - 1  # of "all"
+_ARMS = get_args(ArmName)
+# An arm by its name, or a function of a file of the user's.
+Arm = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({'|'.join(_ARMS)}|[^\0-\x1f]+\.py:[A-Za-z_]\w*)\Z",
+        description=f"{', '.join(_ARMS)} or FILE.py:NAME",
+    ),
+]
 
 
 class Mark(enum.Enum):
@@ -141,12 +149,16 @@ class Basics:
 
     preset: Annotated[Preset, EXPLORED, COUNTED] = "laptop"
     """Numbers to start from: minutes on a laptop, the paper's, or seconds."""
-    arm: Annotated[ArmName, EXPLORED, COUNTED] = "epistemic"
-    """What exploration seeks: disagreement of the ensemble (SU-PETS), rare states
-    (count), nothing (random), the forward task (oracle), one-step disagreement,
-    information gain, disagreement in units of the data (best), or what other methods
+    env: Annotated[str, EXPLORED, COUNTED] = HALF_CHEETAH
+    """The robot: a name (`--list envs` shows all), or FILE.py of your own with
+    `def robot(backend)`, FILE.py:NAME for another function."""
+    arm: Annotated[Arm, EXPLORED, COUNTED] = "epistemic"
+    """What exploration seeks: disagreement of the ensemble (epistemic, SU-PETS), rare
+    states (count), nothing (random), the first task (oracle), disagreement about
+    one-step, info-gain, disagreement in units of the data (best), or what other methods
     seek: jensen-renyi (MAX), opax, ensemble-std (CEE-US), rnd, particle-entropy (APT);
-    the forward task and disagreement (mixture), or nothing, in pink-noise."""
+    the first task and disagreement (mixture), nothing, in pink-noise, or FILE.py:NAME,
+    an objective of your own."""
     seeds: Annotated[tuple[Seed, ...], EXPLORED, COUNTED] = (0,)
     """One run each, side by side in one program; 0 to 2**32 - 1."""
     engine: EngineName = "mjx"
@@ -205,8 +217,11 @@ class Science(Tuning, Evaluation, Exploration):
 class Variant:
     """Which tasks phase 2 is about, and which variant of it this is."""
 
-    task: TaskName = "all"
-    """The task to perform."""
+    task: str = "all"
+    """The task to perform; by default all of the robot."""
+    tasks: str | None = None
+    """FILE.py of your own with `def tasks()`: rewards by name, in place of the robot's
+    tasks."""
     tag: str | None = None
     """Name of a variant of phase 2, with other numbers: it has a folder of its own in
     the run, and, if it is a zero-shot, a row of its own in the report."""
@@ -224,7 +239,7 @@ class Output:
     out: Path = Path("runs")
     """Folder of all runs."""
     name: str | None = None
-    """Name of the exploration run; by default PRESET-ARM."""
+    """Name of the exploration run; by default PRESET-ARM, or PRESET-ROBOT-ARM."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,25 +3,22 @@
 import itertools
 from collections.abc import Sequence
 
-from experiments.config import NUM_TASKS, UNPLANNED, Config, PlannerConfig
+from experiments import robots
+from experiments.config import UNPLANNED, Config, PlannerConfig
 from experiments.errors import UsageError
 
 # Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
 _CPU_FLOPS_AN_HOUR = 1e11 * 3600
 
 
-def model_flops(hidden_sizes: Sequence[int]) -> float:
+def model_flops(widths: Sequence[int]) -> float:
     """Returns the operations of a particle's step, two per multiply-add.
 
     Only the network's matrix products are counted.
-    """
-    from jaxpets.envs import half_cheetah  # brings mujoco, which flags need not
 
-    widths = (
-        half_cheetah.OBS_SIZE + half_cheetah.ACTION_SIZE,  # pitch as sine and cosine,
-        *hidden_sizes,  # but no finite-difference velocity
-        2 * half_cheetah.OBS_SIZE,
-    )
+    Args:
+      widths: of the layers, from what the network reads to what it says.
+    """
     return 2.0 * sum(a * b for a, b in itertools.pairwise(widths))
 
 
@@ -32,13 +29,19 @@ def check_cpu(config: Config) -> None:
       UsageError: with the hours that it would take.
     """
     import jax
+    import jax.numpy as jnp
 
     if jax.default_backend() != "cpu" or config.allow_cpu:
         return
     _, search = _search(config)
     rows = search.num_samples * search.num_particles * search.num_iterations
     steps = _planned_steps(config) * len(config.seeds)
-    flops = model_flops((config.model.hidden_size,) * config.model.num_layers)
+    robot = robots.of(config)
+    obs_size, action_size = robots.sizes(robot)
+    obs = jax.ShapeDtypeStruct((obs_size,), jnp.float32)
+    read = jax.eval_shape(robot.space.features, obs).shape[0] + action_size
+    hidden = [config.model.hidden_size] * config.model.num_layers
+    flops = model_flops([read, *hidden, 2 * obs_size])
     hours = flops * rows * search.horizon * steps / _CPU_FLOPS_AN_HOUR
     if hours > 1:
         raise UsageError(
@@ -72,7 +75,9 @@ def _search(config: Config) -> tuple[str, PlannerConfig]:
 
 def _num_tasks(config: Config) -> int:
     """Returns how many tasks are planned for at once; exploration is one."""
-    return NUM_TASKS if config.phase != "explore" and config.task == "all" else 1
+    if config.phase == "explore" or config.task != "all":
+        return 1
+    return len(robots.of(config).tasks.names)
 
 
 def _planned_steps(config: Config) -> int:

@@ -71,7 +71,7 @@ def valid(hint: Any) -> str:
     if get_origin(hint) is Annotated:
         for about in hint.__metadata__:
             if isinstance(about, msgspec.Meta):
-                return f"{about.ge:,} to {about.le:,}"
+                return about.description or f"{about.ge:,} to {about.le:,}"
         return valid(hint.__origin__)
     if get_origin(hint) in (Union, UnionType):
         return " or ".join(map(valid, get_args(hint)))

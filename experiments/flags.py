@@ -78,7 +78,7 @@ COMMANDS = {
     "report": Report,
 }
 _PROG = "experiments.run"
-_ABOUT = """Unsupervised exploration with deep model-based RL on HalfCheetah.
+_ABOUT = """Unsupervised exploration with deep model-based RL, of any robot.
 
 {}
 
@@ -86,7 +86,8 @@ The same command continues a run that was stopped.
 
 `explore` may be said as `--phase explore`, anywhere among the flags.
 
-These are the flags used most; `explore --help` has all numbers of a phase."""
+These are the flags used most; `explore --help` has all numbers of a phase, and
+`--list envs` shows all robots."""
 
 
 def of(

@@ -9,7 +9,7 @@ from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from experiments import acting, records
-from experiments.acting import Tick, Trials
+from experiments.acting import Scorer, Tick, Trials
 from experiments.build import Learn, State
 from experiments.parallel import devices
 from experiments.parallel.devices import Placement
@@ -22,6 +22,11 @@ class Phase(Protocol):
 
     name: ClassVar[str]
     axes: ClassVar[tuple[str, ...]]  # of the branches
+
+    @property
+    def scorer(self) -> Scorer:
+        """What trials are scored with."""
+        ...
 
     @property
     def placement(self) -> Placement:
@@ -91,7 +96,8 @@ def run(
             jax.block_until_ready(state)
             seconds = {"act": acted - begin, "fit": time.monotonic() - acted}
             learned, fit = collect((state, fit))
-            rows = records.rows(phase.labels(trial), trials, fit, learned.params)
+            labels = phase.labels(trial)
+            rows = records.rows(phase.scorer, labels, trials, fit, learned.params)
             timed = [{**row, "seconds": seconds} for row in rows]
             folder.record(trial, timed, learned, finite=(learned.params, learned.fit))
             text = f"{phase.name} {trial}/{last}  {records.describe(rows)}"

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import acting, exploration, loop, records
-from experiments.acting import Actors, Tick, Trials
+from experiments import acting, exploration, loop, records, robots
+from experiments.acting import Actors, Scorer, Tick, Trials
 from experiments.build import (
     EXPLORE,
     FINETUNE,
@@ -25,6 +25,7 @@ from experiments.build import (
     Parts,
     State,
     build,
+    key_per,
     trial_keys,
 )
 from experiments.config import UNPLANNED, Config
@@ -33,8 +34,9 @@ from experiments.parallel.devices import SEED, TASK, Placement
 from experiments.progress import Progress
 from experiments.refit import refit
 from experiments.report import coverage
+from experiments.storage import rundir
 from experiments.storage.folder import RunFolder
-from jaxpets.envs import half_cheetah
+from jaxpets.envs import Tasks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +44,7 @@ class _Exploration:
     """Trials of one branch per seed."""
 
     config: Config
+    scorer: Scorer
     placement: Placement
     random: Actors  # at first
     planned: Actors
@@ -67,7 +70,8 @@ class _Exploration:
         config = self.config
         at_first = trial <= config.random_trials
         planner = "random" if at_first else UNPLANNED.get(config.arm, "plan")
-        common = {"phase": "explore", "arm": config.arm, "planner": planner}
+        arm = rundir.label(config.arm)
+        common = {"phase": "explore", "arm": arm, "planner": planner}
         steps = trial * config.trial_length
         return [
             {**common, "seed": seed, "trial": trial, "steps": steps}
@@ -80,11 +84,12 @@ class _Finetuning:
     """Trials of one branch per seed and task."""
 
     config: Config
+    scorer: Scorer
     placement: Placement
     actors: Actors
     learn: Learn
-    tasks: Sequence[str]
-    weights: half_cheetah.TaskWeights  # [K]
+    tasks: Tasks  # K of the robot's, their params where the branches are
+    task_ids: Sequence[int]  # [K]
     explored: int  # trials behind the model
 
     name: ClassVar[str] = "finetune"
@@ -95,22 +100,22 @@ class _Finetuning:
         return self.config.task_length
 
     def keys(self, trial: int) -> Array:
-        return _key_per(_task_ids(self.tasks), trial_keys(self.config, FINETUNE, trial))
+        return key_per(self.task_ids, trial_keys(self.config, FINETUNE, trial))
 
     def act(self, trial: int, state: State, keys: Array, tick: Tick) -> Trials:
         del trial
-        params = jaxpets.PlanParams(state.params, self.weights)
+        params = jaxpets.PlanParams(state.params, self.tasks.params)
         num_chunks = self.trial_length // self.config.chunk_length
         trials = acting.run(self.actors, params, keys[..., None], num_chunks, tick)
         return jax.tree.map(lambda x: x.squeeze(2), trials)
 
     def labels(self, trial: int) -> list[dict[str, Any]]:
-        arm, explored = self.config.arm, self.explored
+        arm, explored = rundir.label(self.config.arm), self.explored
         common = {"phase": "finetune", "arm": arm, "explored_trials": explored}
         return [
             {**common, "seed": seed, "task": task, "trial": trial}
             for seed in self.config.seeds
-            for task in self.tasks
+            for task in self.tasks.names
         ]
 
 
@@ -120,11 +125,15 @@ def explore(config: Config, run: RunFolder) -> None:
     _say_rollout(run, parts.explored_by)
     placement = _placement(run, len(config.seeds))
     length, horizon = config.chunk_length, config.planner.horizon
+    robot = parts.robot
     phase = _Exploration(
         config=config,
+        scorer=acting.scorer(robot),
         placement=placement,
-        random=acting.explorers(parts.env, parts.random, 1, length, placement),
-        planned=acting.explorers(parts.env, parts.explorer, horizon, length, placement),
+        random=acting.explorers(robot.env, parts.random, 1, length, placement),
+        planned=acting.explorers(
+            robot.env, parts.explorer, horizon, length, placement, parts.bind
+        ),
         learn=loop.over_branches(placement, parts.learner, SEED),
     )
     last, saved = config.num_trials, exploration.as_saved(config, parts)
@@ -140,7 +149,7 @@ def explore(config: Config, run: RunFolder) -> None:
     def data(leaves: Mapping[str, Any]) -> State:
         return exploration.data_of(saved(leaves))
 
-    coverage.write(run, config.seeds, data, max(done, last), anew=went_on)
+    coverage.write(run, robot.axes, config.seeds, data, max(done, last), anew=went_on)
 
 
 def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
@@ -148,8 +157,9 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
 
     The jump-start of Table 1. The model that acts is saved beside its log.
     """
-    names, weights = _tasks(config)
-    count = config.eval_trials
+    robot = robots.of(config)
+    tasks = robots.chosen(config, robot)
+    names, count = tasks.names, config.eval_trials
     if run.performed(len(config.seeds) * len(names) * count):
         run.say(f"already complete: {count} of {count} trials.")
         return
@@ -158,14 +168,15 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
     model = _model(config, source, run, step, parts)
     placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
     actors = acting.evaluators(
-        parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
+        robot.env, parts.actor, config.task_planner.horizon, config.chunk_length,
         placement, shared_model=True,
     )  # fmt: skip
-    keys = _key_per(_task_ids(names), trial_keys(config, ZERO_SHOT, step))
-    keys = _key_per(range(config.eval_trials), keys)
+    keys = trial_keys(config, ZERO_SHOT, step)
+    keys = key_per(robots.places(robot, tasks), keys)
+    keys = key_per(range(config.eval_trials), keys)
     params = jaxpets.PlanParams(
         devices.place(placement, model.params, SEED),
-        devices.place(placement, weights, TASK),
+        devices.place(placement, tasks.params, TASK),
     )
     num_chunks = config.task_length // config.chunk_length
     progress = Progress(config.task_length, 0, "zero-shot")
@@ -174,15 +185,17 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
         trials = acting.run(actors, params, keys, num_chunks, progress.tick)
     trials = devices.collect(placement, trials, *devices.AXES)
     records.check_finite(trials, step)
-    common = {"phase": "zero-shot", "arm": config.arm, "explored_trials": step}
+    arm = rundir.label(config.arm)
+    common = {"phase": "zero-shot", "arm": arm, "explored_trials": step}
     labels = [
         {**common, "seed": seed, "task": task, "trial": trial + 1}
         for seed in config.seeds
         for task in names
         for trial in range(config.eval_trials)
     ]
-    rows = records.rows(labels, trials)
-    paths = records.trajectories(trials.transitions, config.seeds, names)
+    scorer = acting.scorer(robot)
+    rows = records.rows(scorer, labels, trials)
+    paths = records.trajectories(scorer, trials, config.seeds, names)
     run.save_trajectories(paths)
     run.log(rows)
     run.say(records.summary(rows, names, time.monotonic() - begin))
@@ -195,18 +208,20 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
     """
     parts = build(config)
     _say_rollout(run, parts.performed_by)
-    names, weights = _tasks(config)
-    placement = _placement(run, len(config.seeds), len(names))
+    robot = parts.robot
+    tasks = robots.chosen(config, robot)
+    placement = _placement(run, len(config.seeds), len(tasks.names))
     phase = _Finetuning(
         config=config,
+        scorer=acting.scorer(robot),
         placement=placement,
         actors=acting.evaluators(
-            parts.env, parts.actor, config.task_planner.horizon, config.chunk_length,
+            robot.env, parts.actor, config.task_planner.horizon, config.chunk_length,
             placement, shared_model=False,
         ),
         learn=loop.over_branches(placement, parts.finetuner, SEED, TASK),
-        tasks=names,
-        weights=devices.place(placement, weights, TASK),
+        tasks=tasks._replace(params=devices.place(placement, tasks.params, TASK)),
+        task_ids=robots.places(robot, tasks),
         explored=step,
     )  # fmt: skip
     state = source.restore_trial(step, exploration.as_saved(config, parts))
@@ -214,7 +229,7 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         state = refit(config, parts, state, step, run)
     capacity = state.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
-    init = _branch(state, len(names), capacity)
+    init = _branch(state, len(tasks.names), capacity)
     data = exploration.data_of(jax.eval_shape(lambda: init))
     last = step + config.finetune_trials
     done, state = run.resume(init, step) or (step, init)
@@ -225,8 +240,13 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         # The last checkpoint holds the trial, so that no stop can lose it.
         dataset = run.restore_trial(last, data, part=True).dataset
         rows = slice(int(dataset.size) - config.task_length, int(dataset.size))
-        shown = jax.tree.map(lambda x: x[:, :, None, rows], dataset.data)
-        run.save_trajectories(records.trajectories(shown, config.seeds, names))
+        seen = jax.tree.map(lambda x: x[:, :, None, rows], dataset.data)
+        keys, _ = acting.split_keys(phase.keys(last))
+        shown = Trials(
+            seen, jnp.zeros(()), acting.constants(robot.env, keys[..., None])
+        )
+        paths = records.trajectories(phase.scorer, shown, config.seeds, tasks.names)
+        run.save_trajectories(paths)
 
 
 def _model(
@@ -273,24 +293,3 @@ def _branch(state: State, num_tasks: int, capacity: int) -> State:
         return x if shared else jnp.repeat(x[:, None], num_tasks, axis=1)
 
     return jax.tree.map(repeat, state)
-
-
-def _tasks(config: Config) -> tuple[Sequence[str], half_cheetah.TaskWeights]:
-    """Returns the names of the tasks and their weights `[K]`."""
-    every = config.task == "all"
-    names = [*half_cheetah.TASK_NAMES] if every else [str(config.task)]
-    ids = jnp.asarray(_task_ids(names))
-    return names, jax.tree.map(lambda x: x[ids], half_cheetah.tasks())
-
-
-def _task_ids(names: Sequence[str]) -> list[int]:
-    return [half_cheetah.TASK_NAMES.index(name) for name in names]
-
-
-def _key_per(ids: Sequence[int], keys: Array) -> Array:
-    """Derives keys `[..., K]` from keys `[...]`; a task has the same key in any set."""
-    data = jnp.asarray(list(ids), jnp.uint32)
-    fold = jax.vmap(jax.random.fold_in, (None, 0))
-    for _ in keys.shape:
-        fold = jax.vmap(fold, (0, None))
-    return fold(keys, data)

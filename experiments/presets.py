@@ -3,7 +3,6 @@
 import dataclasses
 
 from experiments.config import (
-    ArmName,
     Config,
     ModelConfig,
     PlannerConfig,
@@ -77,7 +76,7 @@ _BEST_REFIT = TrainingConfig(800, 256, final_rate=0.005, bootstrap=False)
 _BEST_SEARCH = PlannerConfig(optimizer="icem", num_elites=25, noise_beta=0.5)
 
 
-def preset_config(preset: Preset, arm: ArmName) -> Config:
+def preset_config(preset: Preset, arm: str) -> Config:
     """Returns what to start from; `best` brings some numbers of its own to `paper`."""
     config = PRESETS[preset]
     if (preset, arm) == ("paper", "best"):

@@ -7,10 +7,9 @@ import jax
 import numpy as np
 
 import jaxpets
-from experiments.acting import Trials, score
+from experiments.acting import Scorer, Trials
 from experiments.errors import DivergedError
-from experiments.storage import metrics
-from jaxpets.envs import half_cheetah
+from experiments.storage import metrics, pytrees
 
 # No plan is worth as little but one whose candidates all have the worst value, which is
 # shared by at most 1000 steps.
@@ -27,6 +26,7 @@ def check_finite(trials: Trials, trial: int) -> None:
 
 
 def rows(
+    scorer: Scorer,
     labels: Sequence[dict[str, Any]],
     trials: Trials,
     fit: jaxpets.FitMetrics | None = None,
@@ -35,23 +35,28 @@ def rows(
     """Returns one row per trial, its labels first.
 
     Args:
+      scorer: of the robot.
       labels: what the trials are, in the order of their leading axes.
       trials: any leading axes.
       fit: with the same leading axes.
       params: the model after fitting, with the same leading axes.
     """
-    returns, turns = score(trials.transitions)
+    returns, turns = scorer.score(trials.transitions, trials.constants)
+    names = scorer.names
+    drawn = pytrees.to_host({"constants": trials.constants})
     values = np.asarray(trials.values)
     value, bad = values.mean(axis=-1), (values < _NO_VALUE).sum(axis=-1)
-    flat_returns = np.asarray(returns).reshape(-1, len(half_cheetah.TASK_NAMES))
+    flat_returns = np.asarray(returns).reshape(-1, len(names))
     table = []
     for i, label in enumerate(labels):
         named: dict[str, float] = dict(
-            zip(half_cheetah.TASK_NAMES, flat_returns[i].tolist(), strict=True)
+            zip(names, flat_returns[i].tolist(), strict=True)
         )
         own = None if fit is None or params is None else _fit(fit, params, i)
-        net = np.asarray(turns).flat[i].item()
+        net = None if turns is None else np.asarray(turns).flat[i].item()
         row = metrics.row(label, value.flat[i].item(), net, named, own)
+        where = np.unravel_index(i, value.shape)
+        row |= {name: x[where].tolist() for name, x in drawn.items()}
         count = bad.flat[i].item()
         table.append(row | {"bad_plans": count} if count else row)
     return table
@@ -69,11 +74,16 @@ def _fit(
 
 
 def trajectories(
-    transitions: jaxpets.Transition, seeds: Sequence[int], tasks: Sequence[str]
+    scorer: Scorer, trials: Trials, seeds: Sequence[int], tasks: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """Returns the observations of trials `[S, K, R, T, *]` and what they belong to."""
-    returns, _ = score(transitions)
-    columns = [half_cheetah.TASK_NAMES.index(task) for task in tasks]
+    """Returns the observations of trials `[S, K, R, T, *]` and what they belong to.
+
+    Their constants, where they have any, are `constants/NAME`, `[S, K, R, *]`.
+    """
+    transitions = trials.transitions
+    drawn = pytrees.to_host({"constants": trials.constants})
+    returns, _ = scorer.score(transitions, trials.constants)
+    columns = [scorer.names.index(task) for task in tasks]
     own = [np.asarray(returns)[:, k, :, c] for k, c in enumerate(columns)]
     return {
         "obs": np.asarray(transitions.next_obs),
@@ -81,6 +91,7 @@ def trajectories(
         "seeds": np.asarray(seeds),
         "tasks": np.asarray(tasks),
         "returns": np.stack(own, 1),
+        **drawn,
     }
 
 
@@ -90,7 +101,7 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
     Rows without a task, those of exploration, count for all.
     """
     parts = []
-    for name in half_cheetah.TASK_NAMES:
+    for name in rows[0]["returns"]:
         own = [row["returns"][name] for row in rows if row.get("task", name) == name]
         if own:
             parts.append(f"{name} {np.mean(own):.0f}")
@@ -107,8 +118,9 @@ def summary(
 ) -> str:
     """Returns the lines that end a zero-shot: the returns of every task."""
     lines = [f"zero-shot returns ({seconds:.0f} s):"]
+    width = max(11, *map(len, tasks))
     for task in tasks:
         own = [row["return"] for row in rows if row["task"] == task]
         each = " ".join(f"{value:.0f}" for value in own)
-        lines.append(f"  {task:<11}{sum(own) / len(own):8.0f}   trials: {each}")
+        lines.append(f"  {task:<{width}}{sum(own) / len(own):8.0f}   trials: {each}")
     return "\n".join(lines)

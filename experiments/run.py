@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from experiments import cli, signals
-from experiments.config import NUM_TASKS, Config
+from experiments import cli, robots, signals
+from experiments.config import Config
 from experiments.cost import check_cpu, memory_advice
 from experiments.entries import differences, from_json, to_json
 from experiments.errors import (
@@ -23,6 +23,7 @@ from experiments.errors import (
     last_line,
 )
 from experiments.parallel import distributed
+from experiments.storage import rundir
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
     from experiments.storage.folder import RunFolder
@@ -41,8 +42,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # The library logs what a user cannot act on.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+        if arguments[:1] == ["--list"]:
+            _list(arguments[1:])
+            return 0
         with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
-            plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
+            with _without_gl():
+                plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config)
@@ -52,6 +57,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         signals.say(last_line(error))
         return error.exit_code
     return 0
+
+
+def _list(words: Sequence[str]) -> None:
+    """Prints what there is of a kind."""
+    if list(words) != ["envs"]:
+        said = " ".join(words) or "with no value"
+        raise UsageError(f"--list {said} is not valid; it must be envs.")
+    with _without_gl():
+        print(robots.listing("mujoco"))
 
 
 def _dispatch(config: Config) -> None:
@@ -91,10 +105,11 @@ def _run(config: Config) -> "RunFolder":
 
 
 def _variant(config: Config, step: int) -> str:
-    """Returns the name of the folder of a later phase: zero-shot-060-forward-TAG."""
+    """Returns the name of the folder of a later phase: zero-shot-060-TASKS-TASK-TAG."""
+    tasks = [rundir.label(config.tasks)] if config.tasks else []
     task = [config.task] if config.task != "all" else []
     tag = [config.tag] if config.tag else []
-    return "-".join([config.phase, f"{step:03d}", *task, *tag])
+    return "-".join([config.phase, f"{step:03d}", *tasks, *task, *tag])
 
 
 @contextmanager
@@ -105,7 +120,7 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     plain = to_json(config)
     branches = len(config.seeds)
     if (config.phase, config.task) == ("finetune", "all"):
-        branches *= NUM_TASKS
+        branches *= len(robots.of(config).tasks.names)
     size = _NEEDED_BYTES * branches
     with (
         signals.stoppable() as late,
@@ -133,10 +148,9 @@ def _explored_step(config: Config, source: "RunFolder") -> int:
 def _video(config: Config, run: "RunFolder") -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
     from experiments.tools import video
-    from jaxpets.envs.half_cheetah import TASK_NAMES
 
     assert config.video is not None
-    names = TASK_NAMES if config.task == "all" else (config.task,)
+    names = robots.chosen(config, robots.of(config)).names
     for name in names:
         target = config.video
         if len(names) > 1:
@@ -145,6 +159,7 @@ def _video(config: Config, run: "RunFolder") -> None:
             video.render(
                 run.trajectories,
                 target,
+                env=config.env,
                 task=name,
                 seed=config.seeds[0],
                 trial=1,

@@ -1,9 +1,9 @@
 """What must hold between the numbers of a config."""
 
 import re
-from typing import Any, get_args
+from typing import Any
 
-from experiments.config import UNDIVIDED, Config, PlannerConfig, TaskName
+from experiments.config import UNDIVIDED, Config, PlannerConfig
 from experiments.entries import Mark, entries, flag
 from experiments.errors import UsageError
 from experiments.storage import rundir
@@ -73,15 +73,13 @@ def _check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:
 
 
 def check_names(config: Config) -> None:
-    """Refuses what is no name of a folder, or names another folder of phase 2."""
+    """Refuses what is no name of a folder."""
     for which, name in (("name", config.name), ("tag", config.tag)):
         if name is not None:
             try:
                 rundir.check_name(name)
             except UsageError as error:
                 raise UsageError(f"--{which}: {error}") from None
-    task = config.tag in get_args(TaskName)
-    require(not task, "--tag", config.tag, "something else; it is a task")
 
 
 def check_explored(config: Config, explored: Config) -> None:

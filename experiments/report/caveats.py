@@ -10,7 +10,7 @@ import numpy as np
 from experiments.config import Config, Evaluation, Exploration, Mark, Tuning
 from experiments.entries import entries
 from experiments.report.logs import Row, Scores, number
-from experiments.report.tables import ARMS, TASKS, flat, in_order
+from experiments.report.tables import ARMS, flat, in_order, tasks_of
 from experiments.storage import rundir
 
 # What a phase depends on; the rest it keeps in its config for the phases after it.
@@ -85,14 +85,14 @@ def _missing(rows: Sequence[Row], found: Scores, explored: int) -> Iterator[str]
     ]
     if absent:
         yield f"Missing: no log of {_list(absent)}."
-    none = f"no zero-shot after {explored} trials"
+    none, every = f"no zero-shot after {explored} trials", tasks_of(rows)
     for arm in in_order(arms):
         seeds = {row.seed for row in rows if row.arm == arm}
-        lacks = [task for task in TASKS if not found.get(arm, {}).get(task)]
+        lacks = [task for task in every if not found.get(arm, {}).get(task)]
         if lacks:
             yield f"Missing: `{arm}` has {none} on {_list(lacks)}."
         tasks_without: dict[tuple[int, ...], list[str]] = {}
-        for task in (task for task in TASKS if task not in lacks):
+        for task in (task for task in every if task not in lacks):
             left = tuple(sorted(seeds - set(found[arm][task])))
             tasks_without.setdefault(left, []).append(task)
         for left, tasks in tasks_without.items():

@@ -1,17 +1,16 @@
 """Sections of the report on the data of the arms: what it covers, who predicts it."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from experiments.errors import UsageError
 from experiments.report import coverage, figures, tables
-from experiments.report.coverage import Counts
+from experiments.report.coverage import Scale, Seen
 from experiments.storage import rundir
 
 _COVERAGE = (
-    "Where the transitions of exploration ended: bins of 0.5 m/s by 1 rad/s, the "
+    "Where the transitions of exploration ended: {bins}, the "
     "outermost ones open; white is a cell that no seed saw. Cells of the table: mean ± "
     "standard deviation over seeds; % is of a seed's transitions. Arms with other "
     "numbers of transitions cannot be compared by cells."
@@ -31,25 +30,30 @@ _NLL = (
 )
 
 
-def covered(by_arm: Mapping[str, Counts], picture: Path) -> list[str]:
+def covered(seen: Seen | None, picture: Path) -> list[str]:
     """Draws what each arm saw, and returns the section on it.
 
     Args:
-      by_arm: counts `[V, W]` by arm and seed; none gives no section and no picture.
+      seen: of all arms; None gives no section and no picture.
       picture: file to write.
     """
-    if not by_arm:
+    if seen is None:
         return []
-    by_arm = {arm: by_arm[arm] for arm in tables.in_order(by_arm)}
+    by_arm = {arm: seen.by_arm[arm] for arm in tables.in_order(seen.by_arm)}
     means = {arm: np.mean([*seeds.values()], axis=0) for arm, seeds in by_arm.items()}
-    edges = coverage.VELOCITY_EDGES, coverage.PITCH_RATE_EDGES
-    figures.coverage(picture, means, *edges)
+    figures.coverage(picture, means, *seen.scales)
     measured = {
-        arm: {seed: coverage.measures(counts) for seed, counts in seeds.items()}
+        arm: {s: coverage.measures(seen.scales, x) for s, x in seeds.items()}
         for arm, seeds in by_arm.items()
     }
     lines = ["## State coverage", "", f"![what each arm saw]({picture.name})", ""]
-    return [*lines, _COVERAGE, "", *tables.measures(measured)]
+    text = _COVERAGE.format(bins=" by ".join(map(_bins, seen.scales)))
+    return [*lines, text, "", *tables.measures(measured)]
+
+
+def _bins(scale: Scale) -> str:
+    width = (scale.edges[-1] - scale.edges[0]) / (len(scale.edges) - 1)
+    return f"{len(scale.edges) - 1} bins of {width:.3g} {scale.unit} ({scale.name})"
 
 
 def model_error(path: Path, preset: str) -> list[str]:

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from experiments.report import stats, style
+from experiments.report.coverage import Scale
 
 _LOG_RATIO = 1000.0  # a range that a linear axis would hide
 
@@ -140,13 +141,13 @@ def exploration(target: Path, value: Curves, turns: Curves) -> None:
             if column:
                 below.sharey(grid[1, 0])
         grid[0, 0].set_ylabel("exploration value\nper imagined step")
-        grid[1, 0].set_ylabel("turns of the pitch\nin a trial")
+        grid[1, 0].set_ylabel("net turns\nin a trial")
         style.save(figure, target)
 
 
 def coverage(
     target: Path, mean_counts: Mapping[str, np.ndarray],
-    velocity_edges: Sequence[float], pitch_rate_edges: Sequence[float],
+    first: Scale, second: Scale,
 ) -> None:  # fmt: skip
     """Draws mean counts `[V, W]`, a panel per arm, all in one scale of colours."""
     seen = np.concatenate([x[x > 0] for x in mean_counts.values()])
@@ -163,12 +164,12 @@ def coverage(
         for axes, (arm, counts) in zip(grid.flat, mean_counts.items(), strict=False):
             axes.set_title(arm)
             mesh = axes.pcolormesh(
-                velocity_edges, pitch_rate_edges,
+                first.edges, second.edges,
                 np.where(counts > 0, counts, np.nan).T, norm=norm, cmap="cividis",
             )  # fmt: skip
             axes.tick_params(labelbottom=True)  # also above a place without a panel
-        figure.supxlabel("forward velocity, m/s", fontsize=9)
-        figure.supylabel("pitch rate, rad/s (nose down > 0)", fontsize=9)
+        for scale, write in ((first, figure.supxlabel), (second, figure.supylabel)):
+            write(f"{scale.name.replace('_', ' ')}, {scale.unit}", fontsize=9)
         figure.colorbar(mesh, ax=grid, label="transitions of a seed, mean")
         style.save(figure, target)
 

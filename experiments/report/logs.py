@@ -20,7 +20,8 @@ class _Labels(msgspec.Struct):
     """What the report reads of a config; some of it gets into names of files."""
 
     preset: Name
-    arm: Name = "epistemic"
+    env: str = rundir.HALF_CHEETAH
+    arm: str = "epistemic"
     task: Name = "all"
     tag: Name | None = None
     num_bits: int = 0

@@ -17,7 +17,7 @@ from experiments.report import (
     tables,
     task_sections,
 )
-from experiments.report.coverage import Counts
+from experiments.report.coverage import Seen
 from experiments.report.figures import Curve, TaskPanels
 from experiments.report.logs import (
     Points,
@@ -28,7 +28,6 @@ from experiments.report.logs import (
     scores,
     tuning,
 )
-from experiments.report.tables import TASKS
 from experiments.storage import disk
 
 __all__ = ["load", "write_report"]
@@ -36,8 +35,8 @@ __all__ = ["load", "write_report"]
 _PAPER_TRIALS = 60
 
 _FIGURE_4 = (
-    "Left: return under each task while exploring without it (the oracle has "
-    "forward's). Right: zero-shot (dot: mean of all its seeds) and fine-tuning. Bold: "
+    "Left: return under each task while exploring without it (the oracle has that of "
+    "the first). Right: zero-shot (dot: mean of all its seeds) and fine-tuning. Bold: "
     "mean of the seeds, where all have a number; thin: one seed; dotted: mean of each "
     "seed's best so far."
 )
@@ -55,8 +54,9 @@ class _Files(NamedTuple):
 def write_report(out: Path, target: Path) -> list[Path]:
     """Writes report.md, table1.json and the figures from all logs under a folder.
 
-    With logs of several presets each has files of its own: `paper` (or else the first)
-    under these names, the others with the preset in the name.
+    With logs of several presets or robots each has files of its own: `paper` (or else
+    the first) under these names, the others with the preset, and with the robot if that
+    is not the paper's, in the name.
 
     Args:
       out: holds runs at any depth, and model_error.json if there is one.
@@ -85,23 +85,21 @@ def write_report(out: Path, target: Path) -> list[Path]:
             exploration=target / f"exploration{suffix}.png",
             coverage=target / f"coverage{suffix}.png",
         )
-        counts = seen.get(preset, {})
+        covered = seen.get(preset)
         own = [row for row in rows if row.preset == preset]
         for optional in (files.zero_shot, files.coverage):
             optional.unlink(missing_ok=True)  # of a report on other logs
-        _write(own, counts, out, files)
+        _write(own, covered, out, files)
         written += [file for file in files if file.exists()]
     return written
 
 
-def _write(
-    rows: Sequence[Row], counts: Mapping[str, Counts], out: Path, files: _Files
-) -> None:
+def _write(rows: Sequence[Row], covered: Seen | None, out: Path, files: _Files) -> None:
     """Writes the files of one preset."""
     every, rows = rows, [row for row in rows if not row.tag] or rows
     explored = _explored(rows)
     found = scores(rows, explored)
-    _write_json(files.table_1, found)
+    _write_json(files.table_1, tables.tasks_of(rows), found)
     _draw(rows, found, explored, files)
     lines = [
         f"# Report of preset `{rows[0].preset}`",
@@ -124,7 +122,7 @@ def _write(
         "",
         "The arms value different things; compare their turns, not their values.",
         "",
-        *coverage_section.covered(counts, files.coverage),
+        *coverage_section.covered(covered, files.coverage),
         *coverage_section.model_error(out / "model_error.json", rows[0].preset),
         *_ablation(out / "ablation.jsonl"),
         *_runs(every, out),
@@ -151,12 +149,12 @@ def _explored(rows: Sequence[Row]) -> int:
     return max(counts, default=max(row.trial for row in rows))
 
 
-def _write_json(path: Path, found: Scores) -> None:
+def _write_json(path: Path, tasks: Sequence[str], found: Scores) -> None:
     """Writes `{arm: {task: {seeds, mean, iqm, ci95}}}`; null is not finite, or none."""
     table: dict[str, Any] = {}
     for arm in tables.in_order(found):
         table[arm] = {}
-        for task in (task for task in TASKS if task in found[arm]):
+        for task in (task for task in tasks if task in found[arm]):
             values = np.array(list(found[arm][task].values()), float)
             summary = stats.summarize(values)
             table[arm][task] = {
@@ -184,7 +182,7 @@ def _curve(points: Points) -> Curve:
 def _panels(rows: Sequence[Row], found: Scores, explored: int) -> dict[str, TaskPanels]:
     """Returns Figure 4 by task."""
     panels = {}
-    for task in TASKS:
+    for task in tables.tasks_of(rows):
         starts = {
             arm: found[arm][task]
             for arm in tables.in_order(found)

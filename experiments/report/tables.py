@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments.report import stats
-from experiments.report.logs import Points, Scores
+from experiments.report.logs import Points, Row, Scores
 from experiments.storage import rundir
 
 TASKS = ("forward", "backward", "front-flip", "back-flip")
@@ -75,14 +75,27 @@ def cell(scores: Mapping[int, float], *, full: bool = False) -> str:
     return text if few else f"{text}<br>IQM {format_number(summary.iqm)}"
 
 
-def table_1(scores: Scores, *, with_paper: bool) -> list[str]:
+def tasks_of(rows: Iterable[Row]) -> list[str]:
+    """Returns the tasks that runs of a robot speak of, those of the paper first."""
+    found: dict[str, None] = {}
+    for row in rows:
+        own = [row.task] if row.task else []
+        found |= dict.fromkeys([*(row.data.get("returns") or {}), *own])
+    return sorted(found, key=lambda x: TASKS.index(x) if x in TASKS else len(TASKS))
+
+
+def table_1(
+    tasks: Sequence[str], scores: Scores, *, with_paper: bool
+) -> list[str]:  # fmt: skip
     """Returns the layout of the paper's Table 1: tasks by arms."""
     paper = PAPER_TABLE_1 if with_paper else {}
     header = ["task", *scores, *(f"paper: {name}" for name in paper)]
     rows = []
-    for i, task in enumerate(TASKS):
+    for task in tasks:
         own = [cell(by_task.get(task, {}), full=True) for by_task in scores.values()]
-        rows.append([task, *own, *(str(column[i]) for column in paper.values())])
+        place = TASKS.index(task) if task in TASKS else None
+        theirs = ["" if place is None else str(x[place]) for x in paper.values()]
+        rows.append([task, *own, *theirs])
     counts = [
         len({s for t in by_task.values() for s in t}) for by_task in scores.values()
     ]
@@ -90,22 +103,22 @@ def table_1(scores: Scores, *, with_paper: bool) -> list[str]:
     return table(header, rows)
 
 
-def every_seed(scores: Scores) -> list[str]:
+def every_seed(tasks: Sequence[str], scores: Scores) -> list[str]:
     """Returns the score of every seed."""
     rows = []
     for arm, by_task in scores.items():
         for seed in sorted({seed for task in by_task.values() for seed in task}):
-            cells = [by_task.get(task, {}).get(seed) for task in TASKS]
+            cells = [by_task.get(task, {}).get(seed) for task in tasks]
             shown = [_MISSING if x is None else format_number(x) for x in cells]
             rows.append([arm, str(seed), *shown])
-    return table(["arm", "seed", *TASKS], rows)
+    return table(["arm", "seed", *tasks], rows)
 
 
-def improvement(scores: Scores, arm: str) -> list[str]:
+def improvement(tasks: Sequence[str], scores: Scores, arm: str) -> list[str]:
     """Returns the probability that a seed of `arm` beats one of another arm."""
     others = [other for other in scores if other != arm]
     rows = []
-    for task in TASKS:
+    for task in tasks:
         ours = _finite(scores[arm].get(task, {}))
         row = [task]
         for other in others:
@@ -122,17 +135,19 @@ def _finite(scores: Mapping[int, float]) -> np.ndarray:
     return values[np.isfinite(values)]
 
 
-def differences(scores: Scores, pairs: Iterable[tuple[str, str]]) -> list[str]:
+def differences(
+    tasks: Sequence[str], scores: Scores, pairs: Iterable[tuple[str, str]]
+) -> list[str]:
     """Returns the mean of one arm minus that of another, with Welch's interval."""
     rows = []
     for ours, theirs in pairs:
         row = [ours, theirs]
-        for task in TASKS:
+        for task in tasks:
             a, b = (_finite(scores[arm].get(task, {})) for arm in (ours, theirs))
             found = stats.difference(a, b) if len(a) and len(b) else None
             row.append(_MISSING if found is None else _difference(found))
         rows.append(row)
-    return table(["mean of", "minus that of", *TASKS], rows)
+    return table(["mean of", "minus that of", *tasks], rows)
 
 
 def _difference(found: stats.Difference) -> str:
@@ -143,27 +158,29 @@ def _difference(found: stats.Difference) -> str:
     return f"{text} [{low}, {high}]"
 
 
-def variants(scores_at: Mapping[tuple[str, str, int], Scores]) -> list[str]:
+def variants(
+    tasks: Sequence[str], scores_at: Mapping[tuple[str, str, int], Scores]
+) -> list[str]:
     """Returns zero-shot scores of runs with a tag, by tag, arm and explored trials."""
     rows = []
     for (tag, arm, explored), scores in sorted(scores_at.items()):
         by_task = scores[arm]
-        cells = [cell(by_task.get(task, {}), full=True) for task in TASKS]
+        cells = [cell(by_task.get(task, {}), full=True) for task in tasks]
         seeds = sorted({seed for task in by_task.values() for seed in task})
         rows.append([tag, arm, str(explored), " ".join(map(str, seeds)), *cells])
-    return table(["variant", "arm", "explored trials", "seeds", *TASKS], rows)
+    return table(["variant", "arm", "explored trials", "seeds", *tasks], rows)
 
 
-def by_trials(scores_at: Mapping[int, Scores]) -> list[str]:
+def by_trials(tasks: Sequence[str], scores_at: Mapping[int, Scores]) -> list[str]:
     """Returns zero-shot scores by the number of exploration trials."""
     arms = in_order({arm for scores in scores_at.values() for arm in scores})
     rows = [
-        [arm, str(trials), *(cell(scores[arm].get(task, {})) for task in TASKS)]
+        [arm, str(trials), *(cell(scores[arm].get(task, {})) for task in tasks)]
         for arm in arms
         for trials, scores in sorted(scores_at.items())
         if arm in scores
     ]
-    return table(["arm", "explored trials", *TASKS], rows)
+    return table(["arm", "explored trials", *tasks], rows)
 
 
 def fine_tuning(task: str, tuning: Mapping[str, Points]) -> list[str]:

@@ -8,7 +8,6 @@ import numpy as np
 
 from experiments.report import figures, tables
 from experiments.report.logs import Row, Scores, named_by_tag, number, scores, tuning
-from experiments.report.tables import TASKS
 
 _OURS = ("best", "epistemic")  # what the other arms are baselines of
 
@@ -16,7 +15,10 @@ _TABLE_1 = (
     "The jump-start: the return of a trial under the task's reward before anything is "
     "learned from it. A seed's score is the mean of its evaluation trials. Cells: mean "
     "± standard deviation over seeds, [95 % interval of the mean, Student's t over "
-    "seeds], interquartile mean (IQM) from four seeds on. Flips are named by "
+    "seeds], interquartile mean (IQM) from four seeds on."
+)
+_FLIPS = (
+    " Flips are named by "
     "physics: a front flip turns nose down. The paper's Figure 3 has the names the "
     "other way round, so its two flip rows may be exchanged."
 )
@@ -49,21 +51,23 @@ def zero_shot(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
     if not found:
         return [*lines, "No zero-shot log.", ""]
     found = {arm: found[arm] for arm in tables.in_order(found)}
-    lines += tables.table_1(found, with_paper=rows[0].preset == "paper")
+    tasks, is_paper = tables.tasks_of(rows), rows[0].preset == "paper"
+    lines += tables.table_1(tasks, found, with_paper=is_paper)
     lines += [
-        _TABLE_1,
+        _TABLE_1 + _FLIPS * (tables.TASKS[2] in tasks),
         "",
         *_random_actions(rows),
         "### Every seed",
         "",
-        *tables.every_seed(found),
+        *tables.every_seed(tasks, found),
     ]
     for ours in (arm for arm in _OURS if arm in found and len(found) > 1):
         lines += ["### Probability of improvement", ""]
-        lines += tables.improvement(found, ours)
+        lines += tables.improvement(tasks, found, ours)
     if len(counts) > 1:
         lines += ["## Data efficiency: zero-shot return by exploration trials", ""]
-        lines += tables.by_trials({count: scores(rows, count) for count in counts})
+        by_count = {count: scores(rows, count) for count in counts}
+        lines += tables.by_trials(tasks, by_count)
     return lines
 
 
@@ -76,7 +80,8 @@ def variants(rows: Sequence[Row]) -> list[str]:
     for row in tagged:
         by_variant.setdefault((row.tag, row.arm, row.explored), []).append(row)
     found = {key: scores(own, key[2]) for key, own in by_variant.items()}
-    return ["## Variants", "", _VARIANTS, "", *tables.variants(found)]
+    table = tables.variants(tables.tasks_of(tagged), found)
+    return ["## Variants", "", _VARIANTS, "", *table]
 
 
 def compared(rows: Sequence[Row], explored: int, picture: Path) -> list[str]:
@@ -91,22 +96,24 @@ def compared(rows: Sequence[Row], explored: int, picture: Path) -> list[str]:
     found = {name: found[name] for name in tables.in_order(found)}
     if not found:
         return []
+    tasks = tables.tasks_of(rows)
     whole = {
-        name: {task: np.array(list(by_task[task].values())) for task in TASKS}
+        name: {task: np.array(list(by_task[task].values())) for task in tasks}
         for name, by_task in found.items()
-        if set(TASKS) <= set(by_task)
+        if set(tasks) <= set(by_task)
     }
     is_paper = rows[0].preset == "paper"
     reference: dict[str, float] = {}
     if is_paper:
-        reference = dict(zip(TASKS, tables.PAPER_TABLE_1["SU-PETS"], strict=True))
+        paper = tables.PAPER_TABLE_1["SU-PETS"]
+        reference = dict(zip(tables.TASKS, paper, strict=True))
     lines = ["## Arms and variants side by side", ""]
     if whole:
         figures.zero_shot(picture, whole, reference)
         text = _ZERO_SHOT + _REFERENCE * is_paper
         lines += [f"![zero-shot returns]({picture.name})", "", text, ""]
     if pairs := _pairs(list(found)):
-        lines += [_DIFFERENCES, "", *tables.differences(found, pairs)]
+        lines += [_DIFFERENCES, "", *tables.differences(tasks, found, pairs)]
     return lines
 
 
@@ -140,7 +147,7 @@ def _random_actions(rows: Sequence[Row]) -> list[str]:
         or (row.phase, row.arm) == ("explore", "random")
     }.values()
     means = []
-    for task in TASKS:
+    for task in tables.tasks_of(rows):
         values = [(row.data.get("returns") or {}).get(task) for row in random]
         values = np.array([*map(number, values)])
         if np.isfinite(values).any():
@@ -158,7 +165,7 @@ def fine_tuning(rows: Sequence[Row], explored: int) -> list[str]:
     named = named_by_tag(rows)
     by_task = [
         tables.fine_tuning(task, {arm: tuned[arm] for arm in tables.in_order(tuned)})
-        for task in TASKS
+        for task in tables.tasks_of(rows)
         if (tuned := tuning(named, task, explored))
     ]
     if not by_task:

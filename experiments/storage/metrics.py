@@ -5,12 +5,14 @@ A row is a trial of a seed, and of a task where one is sought:
     phase, arm, seed, trial  exploration has planner and steps too, the others task and
                              explored_trials, the trials behind their model
     value                    predicted reward per imagined step
-    turns                    net turns of the torso, nose down
+    turns                    net turns of the torso, nose down; left out of a robot of
+                             which none are counted
     bad_plans                steps whose every candidate was imagined to be not finite;
                              left out where there is none
     returns                  of the trial under every task; return is that of its own
     fit                      of the model after the trial, where there was one
     seconds                  act and fit
+    constants, constants/... what was drawn for the trial, where anything is
 
 Null is a number that is not finite. The log is JSON Lines. A run that is resumed cuts
 it back to the trials that its checkpoint knows of, so that each trial is in it once.
@@ -36,7 +38,7 @@ _RENAMED = {"loss": "nll"}
 class Row(NamedTuple):
     """A line of a log, with what its run says about it."""
 
-    preset: str
+    preset: str  # with the robot, as `rundir.study` has it
     arm: str  # with the number of bits for count: count-32
     phase: str
     seed: int
@@ -49,11 +51,13 @@ class Row(NamedTuple):
 
 
 def row(
-    label: Mapping[str, Any], value: float, turns: float, returns: Mapping[str, float],
-    fit: Mapping[str, float] | None = None,
+    label: Mapping[str, Any], value: float, turns: float | None,
+    returns: Mapping[str, float], fit: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Returns a row as it is written; its label says what the trial is."""
     found = {**label, "value": value, "turns": turns, "returns": returns}
+    if turns is None:
+        del found["turns"]
     if label.get("task"):
         found["return"] = returns[label["task"]]
     return found if fit is None else found | {"fit": fit}
@@ -63,7 +67,7 @@ def arm_label(arm: str, config: Mapping[str, Any]) -> str:
     """Returns what the report calls an arm: count has its number of bits, count-32."""
     if arm == "count" and "num_bits" in config:
         return f"count-{config['num_bits']}"
-    return arm
+    return rundir.label(arm)
 
 
 def number(value: Any) -> float:
@@ -121,7 +125,7 @@ def _parsed(data: Any, config: Mapping[str, Any], run: Path) -> Row:
         fit = {_RENAMED.get(name, name): value for name, value in fit.items()}
         data = data | {"fit": fit}
     return Row(
-        preset=config["preset"],
+        preset=rundir.study(config),
         arm=arm_label(line.arm, config),
         phase=data["phase"],
         seed=line.seed,

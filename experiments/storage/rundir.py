@@ -6,6 +6,7 @@ import fcntl
 import json
 import math
 import os
+import re
 import socket
 import time
 from collections import Counter
@@ -38,11 +39,33 @@ TRAJECTORIES = "trajectories.npz"
 # What can only be one file or folder below another.
 Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 _MAX_JSON_BYTES = 1_000_000
+HALF_CHEETAH = "pets/half_cheetah"  # the robot of the paper, which no name mentions
 
 
 def now() -> str:
     """Returns the time in UTC, to the second."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def label(text: str) -> str:
+    """Returns what folders and logs call a robot or an arm.
+
+    That is its name, with dashes for what no file may be called; a function of a file,
+    FILE.py:NAME, is FILE-NAME.
+    """
+    if own := re.fullmatch(r"(.+)\.py(?::(\w+))?", text, re.DOTALL):
+        text = "-".join(filter(None, (Path(own[1]).name, own[2])))
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip("._-")[:64]
+
+
+def study(config: Mapping[str, Any]) -> str:
+    """Returns what a config, in JSON, shares with those it may be compared with.
+
+    That is the preset, and the robot unless it is the paper's, as paper-dmc-walker.
+    """
+    env = config.get("env", HALF_CHEETAH)
+    robot = [] if env == HALF_CHEETAH else [label(env)]
+    return "-".join([config["preset"], *robot])
 
 
 def check_name(name: str) -> None:

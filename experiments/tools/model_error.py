@@ -9,11 +9,12 @@ no pair.
 error: of the members' mean prediction of the next observation, root mean square over
   transitions and dimensions, each by its target's std in all that was drawn.
 nll: negative log-likelihood in nats per dimension of the equal mixture of the members,
-  over dimensions jointly, / 18.
-Targets are those of PETS: the velocity itself, changes of all else.
+  over dimensions jointly, by their number.
+Targets are what the model of the robot predicts: changes, of most entries.
 """
 
 import argparse
+import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +27,7 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from experiments import exploration
+from experiments import exploration, robots, user_files
 from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import to_json
@@ -34,7 +35,7 @@ from experiments.errors import RunError, UsageError
 from experiments.report import tables
 from experiments.storage import metrics, rundir
 from experiments.storage.folder import RunFolder
-from jaxpets.envs import half_cheetah
+from jaxpets.envs import Robot
 
 # `Ensemble.predict`.
 Predict = Callable[[jaxpets.EnsembleParams, Array, Array], tuple[Array, Array]]
@@ -49,13 +50,16 @@ class Explored(NamedTuple):
     trial: int
 
 
-def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
+def measure(
+    runs: Sequence[Path], num_rows: int, at_trial: int | None, env: str | None = None
+) -> dict:
     """Returns error and nll by the arm of the model and the arm of the data.
 
     Args:
       runs: folders of exploration runs of one preset, no seed of an arm twice.
       num_rows: B, transitions drawn of every seed.
       at_trial: whose checkpoints to read; None for the last of each run.
+      env: the robot, which must be said if it is of a file.
 
     Returns:
       `preset`, `rows`, `trials` by arm and seed, and `error` and `nll` as
@@ -69,13 +73,14 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     configs = [exploration.config_of(RunFolder(run)) for run in runs]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
+    configs = [_without_files(config, env) for config in configs]
     # The random trials of a seed are the same in all arms: all models know them.
     shared = max(config.random_trials for config in configs)
     found = [
         _read(run, config, at_trial, shared * config.trial_length, num_rows)
         for run, config in zip(runs, configs, strict=True)
     ]
-    error, nll = _score_all(found, configs)
+    error, nll = _score_all(robots.of(configs[0]), found, configs)
     arms = [
         arm for arm, config in zip(labels, configs, strict=True) for _ in config.seeds
     ]
@@ -83,7 +88,7 @@ def measure(runs: Sequence[Path], num_rows: int, at_trial: int | None) -> dict:
     for arm, config, run in zip(labels, configs, found, strict=True):
         trials.setdefault(arm, {}).update(dict.fromkeys(config.seeds, run.trial))
     return {
-        "preset": configs[0].preset,
+        "preset": rundir.study(to_json(configs[0])),
         "rows": num_rows,
         "trials": trials,
         "error": by_arm(error, arms),
@@ -95,11 +100,24 @@ def _label(config: Config) -> str:
     return metrics.arm_label(config.arm, to_json(config))
 
 
+def _without_files(config: Config, env: str | None) -> Config:
+    """Returns what a model is to be read with: no file that only a run speaks of.
+
+    What a run sought has no part in what its model predicts.
+    """
+    if user_files.is_file(config.env) and config.env != env:
+        raise UsageError(
+            f"--env {env} is not valid; the runs are of {config.env}, which is a file "
+            f"and runs only if you name it: --env {config.env}."
+        )
+    return dataclasses.replace(config, arm="random", tasks=None)
+
+
 def _check_comparable(
     runs: Sequence[Path], configs: Sequence[Config], labels: Sequence[str]
 ) -> None:
     """Refuses runs of several presets, and a seed of an arm that is there twice."""
-    presets = sorted({config.preset for config in configs})
+    presets = sorted({rundir.study(to_json(config)) for config in configs})
     if len(presets) > 1:
         raise UsageError(f"the runs are of presets {', '.join(presets)}; give one.")
     seen: dict[tuple[str, int], Path] = {}
@@ -164,11 +182,11 @@ def draw(
 
 
 def _score_all(
-    found: Sequence[Explored], configs: Sequence[Config]
+    robot: Robot, found: Sequence[Explored], configs: Sequence[Config]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns error and nll `[M, M]` of all models on the data of all."""
     data = jax.tree.map(lambda *x: jnp.concatenate(x), *(run.data for run in found))
-    target = half_cheetah.model_space().target(data.obs, data.next_obs)
+    target = robot.space.target(data.obs, data.next_obs)
     scale = jnp.std(target, axis=(0, 1))
     programs: dict[Any, Any] = {}  # runs with networks of one size share one
     scores = []
@@ -255,11 +273,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--rows", type=int, default=2000, help="transitions of every seed (2000)"
     )
+    parser.add_argument("--env", help="the robot of the runs, if it is of a file")
     args = parser.parse_args(argv)
     try:
         if not args.out.parent.is_dir():
             raise UsageError(f"--out {args.out} is not valid; there is no such folder.")
-        rundir.write_json(args.out, measure(args.runs, args.rows, args.at_trial))
+        found = measure(args.runs, args.rows, args.at_trial, args.env)
+        rundir.write_json(args.out, found)
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

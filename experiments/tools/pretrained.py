@@ -15,7 +15,7 @@ from pathlib import Path
 
 import jax
 
-from experiments import cli, exploration
+from experiments import cli, exploration, user_files
 from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import to_json
@@ -42,6 +42,8 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
     if folder.exists():
         raise UsageError(f"there is a model in {folder} already; remove it first.")
     config = exploration.config_of(RunFolder(run))
+    if own := [x for x in (config.env, config.arm) if user_files.is_file(x)]:
+        raise UsageError(f"{run} needs {own[0]}, which does not come with the code.")
     seed = config.seeds[0] if seed is None else seed
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))

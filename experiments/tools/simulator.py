@@ -10,25 +10,29 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import tyro
 
 import jaxpets
-from experiments import acting
-from experiments.build import ENGINES, optimizer
+from experiments import acting, robots
+from experiments.build import optimizer
 from experiments.config import EngineName, PlannerConfig
+from experiments.errors import RunError
 from experiments.presets import PRETRAINED_PLANNER
 from experiments.storage import metrics, rundir
 from experiments.storage.environment import environment
-from jaxpets.envs import env_rollout, half_cheetah
+from jaxpets.envs import Robot, env_rollout, with_constants
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Performs every task with the simulator as the model of the search."""
 
+    env: str = rundir.HALF_CHEETAH
+    """The robot, as `experiments.run` takes it."""
     seed: int = 0
     """Of all keys."""
     num_trials: int = 1
@@ -43,44 +47,53 @@ class Arguments:
     """By default the search of the models that come with the code."""
 
 
-def perform(args: Arguments) -> np.ndarray:
+def perform(args: Arguments, robot: Robot) -> np.ndarray:
     """Returns the returns `[K, R]` of R trials of each of the K tasks."""
-    env, search = ENGINES[args.engine](), args.task_planner
-    planner = jaxpets.plan(
-        env_rollout(env), half_cheetah.task_reward, optimizer(search, env)
-    )
+    env, tasks = robot.env, robot.tasks
+    score = acting.scorer(robot).score
+    search = optimizer(args.task_planner, env)
+    planner = jaxpets.plan(env_rollout(env), tasks.reward_fn, search)
 
-    def trial(weights: half_cheetah.TaskWeights, key: jax.Array) -> jax.Array:
+    def trial(task: Any, key: jax.Array) -> jax.Array:
         reset_key, act_key = jax.random.split(key)
+        start = jaxpets.start_trial(env, planner, reset_key)
+        constants = start.env.constants
         _, transitions, _ = jaxpets.unroll(
             env,
             planner,
-            jaxpets.PlanParams((), weights),
+            jaxpets.PlanParams((), with_constants(task, constants)),
             act_key,
-            jaxpets.start_trial(env, planner, reset_key),
+            start,
             length=args.trial_length,
             observe_fn=lambda state: state,
         )
-        return acting.score(transitions)[0]
+        return score(transitions, constants)[0]
 
     trials = jax.jit(jax.vmap(jax.vmap(trial, (None, 0)), (0, None)))
     keys = jax.random.split(jax.random.key(args.seed), args.num_trials)
-    returns = trials(half_cheetah.tasks(), keys)  # [K, R, K]
+    returns = trials(tasks.params, keys)  # [K, R, K]
     own = range(returns.shape[0])
     return np.asarray(returns)[own, :, own]
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Performs, and prints a line per task."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Performs, and prints a line per task; returns the exit code."""
     args = tyro.cli(Arguments, args=argv, prog="experiments.tools.simulator")
+    try:
+        robot = robots.named(args.env, args.engine)
+    except RunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
     begin = time.monotonic()
     where = {"date": rundir.now(), "env": environment()}
-    returns = perform(args)
-    for name, own in zip(half_cheetah.TASK_NAMES, returns, strict=True):
+    returns = perform(args, robot)
+    width = max(11, *map(len, robot.tasks.names))
+    for name, own in zip(robot.tasks.names, returns, strict=True):
         each = " ".join(f"{value:.0f}" for value in own)
-        print(f"{name:<11}{own.mean():8.0f}   trials: {each}")
+        print(f"{name:<{width}}{own.mean():8.0f}   trials: {each}")
         rows = [
             {
+                "env": args.env,
                 "task": name,
                 "seed": args.seed,
                 "trial": i + 1,
@@ -95,7 +108,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         if args.json:
             metrics.append_rows(args.json, rows)
     print(f"{time.monotonic() - begin:.0f} s", file=sys.stderr)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

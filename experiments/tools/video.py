@@ -1,7 +1,7 @@
-"""Renders a recorded trial of HalfCheetah, in a process of its own.
+"""Renders a recorded trial of a robot, in a process of its own.
 
-`python -m experiments.tools.video TRAJECTORIES.npz OUT.mp4 --task forward --seed 0
---trial 1`
+`python -m experiments.tools.video TRAJECTORIES.npz OUT.mp4 --env pets/half_cheetah
+--task forward --seed 0 --trial 1`
 
 OpenGL can crash, and its backend is chosen once per process; an experiment of hours
 must depend on neither. So `render` starts this module as a child.
@@ -13,14 +13,14 @@ import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.errors import RunError, UsageError
 from experiments.storage import disk
+from experiments.tools.renderer import Draw, Look, open_renderer
 
 _NO_GL = 69  # exit code of the child where OpenGL does not work; EX_UNAVAILABLE
 _BACKENDS = ("egl", "osmesa")
@@ -37,18 +37,13 @@ _GIF_COLORS = 48
 _GIF_SKIP = 2  # every second frame
 
 
-class Look(NamedTuple):
-    """Size in pixels and frames per second."""
-
-    width: int = 640
-    height: int = 360
-    fps: int = 20  # the environment's steps a second: real time
-
-
 def render(
-    npz: Path, target: Path, *, task: str, seed: int, trial: int, gif: bool = False
-) -> None:
-    """Renders a trial (see `load_trial`) to mp4, and GIF, in a child process.
+    npz: Path, target: Path, *, task: str, seed: int, trial: int, gif: bool = False,
+    env: str | None = None,
+) -> None:  # fmt: skip
+    """Renders a trial of a robot (see `load_trial`), in a child process.
+
+    It is an mp4 and, if it is asked for, a GIF.
 
     MUJOCO_GL of the user is obeyed; otherwise EGL is tried, then OSMesa.
 
@@ -56,13 +51,14 @@ def render(
       RunError: if no OpenGL works here, or the child fails; one line says why.
     """
     command = [sys.executable, "-m", "experiments.tools.video", str(npz), str(target)]
+    command += [f"--env={env}"] * (env is not None)
     command += [f"--task={task}", f"--seed={seed}", f"--trial={trial}"]
     command += ["--gif"] * gif
     chosen = os.environ.get("MUJOCO_GL")
     failures = []
     for backend in (chosen,) if chosen else _BACKENDS:
-        env = _child_env(backend)
-        child = subprocess.run(command, check=False, env=env, capture_output=True)
+        variables = _child_env(backend)
+        child = subprocess.run(command, check=False, env=variables, capture_output=True)
         if child.returncode == 0:
             return
         said = child.stderr.decode(errors="replace").strip().splitlines()
@@ -89,14 +85,14 @@ def load_trial(npz: Path, *, task: str, seed: int, trial: int) -> np.ndarray:
     """Reads one trial from recorded trajectories.
 
     Args:
-      npz: holds obs `[S, K, R, T, 18]` float32, each after its step, seeds `[S]`,
+      npz: holds obs `[S, K, R, T, D]` float32, each after its step, seeds `[S]`,
         tasks `[K]` and returns `[S, K, R]`.
       task: an entry of tasks.
       seed: an entry of seeds.
       trial: from 1 to R.
 
     Returns:
-      obs `[T, 18]`.
+      obs `[T, D]`.
 
     Raises:
       UsageError: if the file is not such a file or does not hold the trial.
@@ -109,7 +105,7 @@ def load_trial(npz: Path, *, task: str, seed: int, trial: int) -> np.ndarray:
         raise UsageError(f"{npz} holds no trajectories ({error})") from error
     if obs.ndim != 5 or obs.shape[:2] != (len(seeds), len(tasks)):
         raise UsageError(
-            f"{npz}: obs must be [seeds, tasks, trials, steps, 18], got {obs.shape}"
+            f"{npz}: obs must be [seeds, tasks, trials, steps, D], got {obs.shape}"
         )
     seed_names, task_names = seeds.tolist(), tasks.tolist()
     if task not in task_names:
@@ -123,34 +119,6 @@ def load_trial(npz: Path, *, task: str, seed: int, trial: int) -> np.ndarray:
     if not finite.all():
         raise RunError(f"{npz}: the trial is not finite from step {finite.argmin()} on")
     return chosen
-
-
-Draw = Callable[[np.ndarray], np.ndarray]  # qpos [9] -> picture [height, width, 3]
-
-
-def open_renderer(look: Look) -> Draw:
-    """Returns what draws the robot; fails, in many ways, where OpenGL does not work."""
-    import mujoco
-
-    from jaxpets.envs import half_cheetah
-
-    gl: Any = mujoco  # its stubs lack half of it
-    model: Any = half_cheetah.load_model()
-    model.vis.global_.offwidth, model.vis.global_.offheight = look.width, look.height
-    renderer, data = gl.Renderer(model, look.height, look.width), gl.MjData(model)
-    floor = model.geom("floor")
-    # A good runner leaves the 80 m of floor and the light. The floor's pattern repeats,
-    # so a robot put back by whole periods looks the same and stays in the middle.
-    period = 2.0 * floor.size[0] / model.mat(floor.matid[0]).texrepeat[0]
-
-    def draw(qpos: np.ndarray) -> np.ndarray:
-        data.qpos[:] = qpos
-        data.qpos[0] %= period
-        gl.mj_forward(model, data)
-        renderer.update_scene(data, camera="track")
-        return renderer.render()
-
-    return draw
 
 
 def write_mp4(target: Path, pictures: Iterator[np.ndarray], look: Look) -> None:
@@ -198,10 +166,11 @@ def write_gif(target: Path, cut: list[np.ndarray], *, fps: float) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m experiments.tools.video",
-        description="Renders a recorded trial of HalfCheetah to mp4.",
+        description="Renders a recorded trial of a robot to mp4.",
     )
     parser.add_argument("npz", type=Path, help="trajectories.npz of a run")
     parser.add_argument("target", type=Path, help="the .mp4 to write")
+    parser.add_argument("--env", help="the robot; by default pets/half_cheetah")
     parser.add_argument("--task", required=True, help="for example forward")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--trial", type=int, default=1, help="counted from 1")
@@ -236,17 +205,12 @@ def _render_here(args: argparse.Namespace) -> None:
     _check(args)
     obs = load_trial(args.npz, task=args.task, seed=args.seed, trial=args.trial)
     look = Look(args.width, args.height, args.fps)
-    try:
-        draw = open_renderer(look)
-    except Exception as error:  # ImportError, RuntimeError, AttributeError, ...
-        reason = str(error).splitlines() or [type(error).__name__]
-        print(f"error: {reason[0]}", file=sys.stderr)
-        raise SystemExit(_NO_GL) from error
     wanted = _gif_steps(args, len(obs))
     cut: list[np.ndarray] = []
 
     def pictures() -> Iterator[np.ndarray]:
-        for step, qpos in enumerate(_positions(obs)):
+        draw, positions = _opened(args.env, obs, look)
+        for step, qpos in enumerate(positions):
             picture = draw(qpos)
             if step in wanted:
                 cut.append(picture)
@@ -260,13 +224,28 @@ def _render_here(args: argparse.Namespace) -> None:
             write_gif(draft, cut, fps=args.fps / _GIF_SKIP)
 
 
-def _positions(obs: np.ndarray) -> np.ndarray:
-    """Returns qpos `[T, 9]`; called once ffmpeg runs, as JAX dislikes later forks."""
+def _opened(env: str | None, obs: np.ndarray, look: Look) -> tuple[Draw, np.ndarray]:
+    """Returns what draws a robot and where it was, qpos `[T, Q]`.
+
+    It is called once ffmpeg runs, as JAX dislikes later forks.
+    """
     import jax.numpy as jnp
 
-    from jaxpets.envs import half_cheetah
+    from experiments import robots
+    from experiments.storage.rundir import HALF_CHEETAH
 
-    return np.asarray(half_cheetah.qpos_from_obs(jnp.asarray(obs)))
+    try:
+        robot = robots.named(env or HALF_CHEETAH, "mujoco")
+        if robot.model is None or robot.qpos_fn is None:
+            raise UsageError(f"--env {env} has no model that can be drawn.")
+        draw = open_renderer(robot.model, look)
+    except RunError:
+        raise
+    except Exception as error:  # ImportError, RuntimeError, AttributeError, ...
+        reason = str(error).splitlines() or [type(error).__name__]
+        print(f"error: {reason[0]}", file=sys.stderr)
+        raise SystemExit(_NO_GL) from error
+    return draw, np.asarray(robot.qpos_fn(jnp.asarray(obs)))
 
 
 def _gif_steps(args: argparse.Namespace, num_steps: int) -> range:

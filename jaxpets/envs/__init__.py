@@ -2,9 +2,10 @@
 
 from jaxpets.envs.adapters import env_rollout, from_brax
 from jaxpets.envs.named import make, names
-from jaxpets.envs.robot import Robot, Tasks, tasks_of, with_constants
+from jaxpets.envs.robot import Axis, Robot, Tasks, tasks_of, with_constants
 
 __all__ = [
+    "Axis",
     "Robot",
     "Tasks",
     "env_rollout",

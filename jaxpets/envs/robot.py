@@ -1,8 +1,10 @@
 """A robot with what can be asked of it: environment, model coordinates and tasks."""
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -61,7 +63,7 @@ class Robot(NamedTuple):
       env: the environment.
       space: coordinates in which a model sees its observations.
       tasks: what it may perform.
-      axes: two quantities by which exploration is shown.
+      axes: two quantities by which exploration is shown, or none.
       angle: the entry, unwrapped and in rad, of which net turns are counted, if any.
       model: the compiled MuJoCo model to draw it with, or None.
       qpos_fn: `(obs [T, D]) -> [T, Q]`, positions of a recorded trial to draw, or None.
@@ -71,7 +73,7 @@ class Robot(NamedTuple):
     env: Env
     space: ModelSpace
     tasks: Tasks
-    axes: tuple[Axis, Axis]
+    axes: tuple[Axis, Axis] | tuple[()] = ()
     angle: int | None = None
     model: Any = None
     qpos_fn: Callable[[Array], Array] | None = None
@@ -95,6 +97,9 @@ def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:
     names = tuple(rewards)
 
     def reward_fn(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        if action.ndim > 1:  # of a recorded trial: its steps are rewarded one by one
+            steps = functools.partial(reward_fn, params)
+            return jax.vmap(steps)(obs, action, next_obs)
         chosen, constants = params, ()
         if isinstance(params, TrialParams):
             chosen, constants = params

@@ -40,7 +40,11 @@ def acting_program(flags):
     parts = build(config)
     spread = devices.spread(len(config.seeds))
     actors = acting.explorers(
-        parts.env, parts.explorer, config.planner.horizon, config.chunk_length, spread
+        parts.robot.env,
+        parts.explorer,
+        config.planner.horizon,
+        config.chunk_length,
+        spread,
     )
     keys = devices.place(spread, trial_keys(config, EXPLORE, 2), devices.SEED)
     init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)

@@ -87,7 +87,12 @@ explore --preset paper                  | --preset paper; hours; --allow-cpu
 --at-trial 2                            | --at-trial 2; left out in explore
 --video a.mp4                           | --video a.mp4; left out in explore
 --phase zero-shot --arm x               | --arm x; one-step
---phase zero-shot --task swim           | --task swim; back-flip
+--env pets/half_cheeta                  | --env pets/half_cheeta; pets/half_cheetah
+--env robots/none.py                    | --env robots/none.py; there is no such file
+--arm none.py                           | --arm none.py; or FILE.py:NAME
+--arm none.py:bonus                     | --arm none.py:bonus; there is no such file
+--tasks x.py                            | --tasks x.py; left out in explore
+--list envs                             | --list; is not a flag
 --phase zero-shot --name ../x           | --name; '../x'; at most 64
 --num-processes 2                       | --num-processes 2; left out, unless
 --process-id 0                          | --process-id 0; left out, unless
@@ -206,6 +211,11 @@ def test_a_run_keeps_its_labels(fail, out):
         (("--num-bits", "16"), "--num-bits 16 is not valid; it must be 32"),
         (("--num-trials", "4"), "--num-trials 4 is not valid; it must be 3"),
         (("--model.hidden-size", "8"), "--model.hidden-size 8 is not valid"),
+        (("--task", "swim"), "--task swim is not valid; it must be all, forward, back"),
+        (
+            ("--tasks", "x"),
+            "--tasks x is not valid; it must be FILE.py or FILE.py:NAME",
+        ),
         (("--tag", "forward"), "--tag forward is not valid; it must be something else"),
         (("--tag", "../x"), "--tag: run '../x' is not a valid name"),
     ],

@@ -11,9 +11,12 @@ import runs
 from experiments.report import coverage
 from experiments.run import main
 from experiments.storage.folder import RunFolder
+from jaxpets import envs
 from jaxpets.envs import half_cheetah
 
-SHAPE = len(coverage.VELOCITY_EDGES) - 1, len(coverage.PITCH_RATE_EDGES) - 1
+AXES = envs.make("pets/half_cheetah").axes
+SCALES = tuple(coverage.Scale(axis.name, axis.unit, axis.edges) for axis in AXES)
+SHAPE = tuple(len(axis.edges) - 1 for axis in AXES)
 SEEDS = (0, 7)
 
 
@@ -29,8 +32,8 @@ def observations(velocity, pitch_rate):
 
 
 def test_bins_are_those_asked_for():
-    np.testing.assert_allclose(coverage.VELOCITY_EDGES, np.linspace(-8, 8, 33))
-    np.testing.assert_allclose(coverage.PITCH_RATE_EDGES, np.linspace(-15, 15, 31))
+    np.testing.assert_allclose(AXES[0].edges, np.linspace(-8, 8, 33))
+    np.testing.assert_allclose(AXES[1].edges, np.linspace(-15, 15, 31))
 
 
 def test_histogram_is_numpys_with_open_ends():
@@ -38,7 +41,7 @@ def test_histogram_is_numpys_with_open_ends():
     velocity = generator.normal(0.0, 5.0, 3000).astype(np.float32)
     pitch_rate = generator.normal(0.0, 9.0, 3000).astype(np.float32)
     assert abs(velocity).max() > 8 and abs(pitch_rate).max() > 15
-    counts = coverage.histogram(observations(velocity, pitch_rate))
+    counts = coverage.histogram(AXES, observations(velocity, pitch_rate))
     edges = np.linspace(-8, 8, 33), np.linspace(-15, 15, 31)
     # Within the edges all is as NumPy has it; what is beyond goes to the next bin.
     inside = np.clip(velocity, -8, 8), np.clip(pitch_rate, -15, 15)
@@ -61,16 +64,16 @@ def test_histogram_is_numpys_with_open_ends():
     ],
 )
 def test_the_cell_of_one_observation(velocity, pitch_rate, cell):
-    counts = coverage.histogram(observations([velocity], [pitch_rate]))
+    counts = coverage.histogram(AXES, observations([velocity], [pitch_rate]))
     assert np.argwhere(counts).tolist() == [list(cell)]
 
 
 def test_histograms_add_up():
     generator = np.random.default_rng(1)
     obs = observations(*generator.normal(0.0, 4.0, (2, 100)))
-    parts = coverage.histogram(obs[:30]) + coverage.histogram(obs[30:])
-    np.testing.assert_array_equal(coverage.histogram(obs), parts)
-    assert not coverage.histogram(obs[:0]).any()
+    parts = coverage.histogram(AXES, obs[:30]) + coverage.histogram(AXES, obs[30:])
+    np.testing.assert_array_equal(coverage.histogram(AXES, obs), parts)
+    assert not coverage.histogram(AXES, obs[:0]).any()
 
 
 def test_measures_are_shares_of_what_was_seen():
@@ -78,8 +81,8 @@ def test_measures_are_shares_of_what_was_seen():
     velocity, pitch_rate = generator.normal(0.0, [[3.0], [6.0]], (2, 5000))
     # Numbers on an edge: those on a limit count above it.
     velocity[:2], pitch_rate[:2] = (3.0, -3.0), (6.0, -6.0)
-    counts = coverage.histogram(observations(velocity, pitch_rate))
-    found = list(coverage.measures(counts).values())
+    counts = coverage.histogram(AXES, observations(velocity, pitch_rate))
+    found = list(coverage.measures(SCALES, counts).values())
     want = [velocity >= 3, velocity < -3, pitch_rate >= 6, pitch_rate < -6]
     np.testing.assert_allclose(found[3:], [100 * x.mean() for x in want])
     assert found[0] == 5000
@@ -120,10 +123,10 @@ def go_on(folder):
 @pytest.mark.slow
 def test_a_complete_run_has_the_coverage_of_its_data(explored):
     data = json.loads((explored / "coverage.json").read_text())
-    assert set(data) == {"velocity_edges", "pitch_rate_edges", "trial", "counts"}
+    edges = ["velocity_edges", "pitch_rate_edges"]
+    assert [*data] == [*edges, "units", "trial", "counts"]
     assert data["trial"] == runs.LAST
-    assert tuple(data["velocity_edges"]) == coverage.VELOCITY_EDGES
-    assert tuple(data["pitch_rate_edges"]) == coverage.PITCH_RATE_EDGES
+    assert [tuple(data[name]) for name in edges] == [axis.edges for axis in AXES]
     assert list(data["counts"]) == [str(seed) for seed in SEEDS]
     dataset = runs.learner(explored).dataset
     total = runs.LAST * runs.STEPS
@@ -131,12 +134,13 @@ def test_a_complete_run_has_the_coverage_of_its_data(explored):
     for next_obs, counts in zip(
         np.asarray(dataset.data.next_obs), data["counts"].values(), strict=True
     ):
-        np.testing.assert_array_equal(counts, coverage.histogram(next_obs))
+        np.testing.assert_array_equal(counts, coverage.histogram(AXES, next_obs))
         assert np.sum(counts) == total
     first, second = data["counts"].values()
     assert first != second
     found = coverage.load(explored.parent)
-    assert {arm: list(seeds) for arm, seeds in found["smoke"].items()} == {
+    assert found["smoke"].scales == SCALES
+    assert {arm: list(seeds) for arm, seeds in found["smoke"].by_arm.items()} == {
         "epistemic": list(SEEDS)
     }
 
@@ -147,7 +151,9 @@ def test_only_rows_that_are_filled_count(explored, tmp_path):
     (tmp_path / "checkpoints").symlink_to(explored / "checkpoints")
     whole = runs.learner(explored, step=runs.LAST - 1)
     template = jax.tree.map(lambda _: None, whole)._replace(dataset=whole.dataset)
-    coverage.write(RunFolder(tmp_path), SEEDS, template, runs.LAST - 1, anew=False)
+    coverage.write(
+        RunFolder(tmp_path), AXES, SEEDS, template, runs.LAST - 1, anew=False
+    )
     counts = json.loads((tmp_path / "coverage.json").read_text())["counts"]
     assert [np.sum(x) for x in counts.values()] == [(runs.LAST - 1) * runs.STEPS] * 2
 

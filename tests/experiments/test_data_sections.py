@@ -9,8 +9,10 @@ from small_logs import explore_rows, write_run
 
 from experiments.errors import UsageError
 from experiments.report.report import coverage, write_report
+from jaxpets import envs
 
-SHAPE = len(coverage.VELOCITY_EDGES) - 1, len(coverage.PITCH_RATE_EDGES) - 1
+EDGES = [axis.edges for axis in envs.make("pets/half_cheetah").axes]
+SHAPE = tuple(len(edges) - 1 for edges in EDGES)
 
 # Coverage.
 
@@ -26,8 +28,8 @@ def of_cells(**cells):
 
 def write_coverage(run, counts):
     data = {
-        "velocity_edges": coverage.VELOCITY_EDGES,
-        "pitch_rate_edges": coverage.PITCH_RATE_EDGES,
+        "velocity_edges": EDGES[0],
+        "pitch_rate_edges": EDGES[1],
         "counts": {seed: x.tolist() for seed, x in counts.items()},
     }
     (run / "coverage.json").write_text(json.dumps(data))
@@ -58,12 +60,12 @@ def test_coverage_is_read_by_arm_and_seed(out):
     (out / ".hidden").mkdir()
     shutil.copytree(out / "more", out / ".hidden" / "more")
     found = coverage.load(out)
-    assert {arm: sorted(x) for arm, x in found["laptop"].items()} == {
+    assert {arm: sorted(x) for arm, x in found["laptop"].by_arm.items()} == {
         "count-16": [0],
         "epistemic": [0, 1, 2],
     }
     np.testing.assert_array_equal(
-        found["laptop"]["epistemic"][2], of_cells(v0_w29=60, v16_w15=40)
+        found["laptop"].by_arm["epistemic"][2], of_cells(v0_w29=60, v16_w15=40)
     )
 
 

@@ -44,7 +44,8 @@ def test_configs_survive_json(preset, tmp_path):
         ("phase", "zzz", "explore, zero-shot, finetune, report"),
         ("preset", "zzz", "laptop, paper, smoke"),
         ("arm", 3, "epistemic, count,"),
-        ("task", "zzz", "all, forward,"),
+        ("env", 3, "text"),
+        ("task", 3, "text"),
         ("engine", "zzz", "mjx, mujoco"),
         ("planner.optimizer", "adam", "cem, icem, mppi"),
         ("task_planner.precision", "f16", "f32, tf32, bf16"),
@@ -95,7 +96,8 @@ def test_what_a_stranger_may_write_is_a_name_or_a_path_or_refused(value):
             assert entry.name in str(error) and str(error).isprintable()
         else:
             taken.add(entry.name)
-    assert taken == {"out", "name", "tag", "video", "source", "coordinator_address"}
+    texts = {"env", "task", "tasks", "name", "tag", "coordinator_address"}
+    assert taken == texts | {"out", "video", "source"}
     with pytest.raises(CheckpointError) as error:
         from_json({value: 1}, Config(), "runs/x/config.json")
     words = "Use the version that wrote it."

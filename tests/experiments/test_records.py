@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxpets
-from experiments import records
+from experiments import acting, records, robots
 from experiments.acting import Trials
 from experiments.records import describe
 from experiments.storage import metrics
@@ -42,7 +42,8 @@ def test_plans_without_a_finite_candidate_are_counted():
     values[1, :2] = jaxpets.optimizers.WORST_VALUE / 30
     obs = jnp.zeros((2, 3, OBS_SIZE))
     trials = Trials(jaxpets.Transition(obs, jnp.zeros((2, 3, 6)), obs), values)
-    good, bad = records.rows([{"phase": "explore"}] * 2, trials)
+    scorer = acting.scorer(robots.named("pets/half_cheetah", "mujoco"))
+    good, bad = records.rows(scorer, [{"phase": "explore"}] * 2, trials)
     assert "bad_plans" not in good and bad["bad_plans"] == 2
     assert describe([good, bad]).endswith("  bad plans: 2")
 

@@ -129,9 +129,7 @@ def test_load_trial_refuses_what_is_no_trajectory(npz, tmp_path):
             video.load_trial(path, **which)
     arrays = dict(np.load(npz))
     np.savez(tmp_path / "flat.npz", **{**arrays, "obs": arrays["obs"][0]})
-    with pytest.raises(
-        UsageError, match=r"must be \[seeds, tasks, trials, steps, 18\]"
-    ):
+    with pytest.raises(UsageError, match=r"must be \[seeds, tasks, trials, steps, D\]"):
         video.load_trial(tmp_path / "flat.npz", **which)
     arrays["obs"][0, 0, 0, 5:] = np.nan
     np.savez(tmp_path / "nan.npz", **arrays)

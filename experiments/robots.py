@@ -1,0 +1,151 @@
+"""Which robot a run is about, and what it may perform."""
+
+import functools
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+import jaxpets
+from experiments import user_files
+from experiments.config import Config
+from experiments.errors import UsageError
+from experiments.storage import rundir
+
+if TYPE_CHECKING:  # it brings mujoco, which wrong flags need not wait for
+    from jaxpets.envs import Robot, Tasks
+
+
+def of(config: Config) -> "Robot":
+    """Returns the robot of a config, with the tasks of the user's if there are any.
+
+    Raises:
+      UsageError: if there is none of that name, or a file of the user's is at fault.
+    """
+    return named(config.env, config.engine, config.tasks)
+
+
+@functools.lru_cache(maxsize=4)
+def named(env: str, engine: str, tasks: str | None = None) -> "Robot":
+    """Returns a robot, always the same for the same flags; see `of`."""
+    from jaxpets import envs
+
+    if user_files.is_file(env):
+        robot = user_files.made("--env", env, "robot", _checked, engine)
+    else:
+        try:
+            robot = envs.make(env, backend=engine)
+        except ValueError as error:
+            raise UsageError(f"--env {env} is not valid; {error}") from error
+    if tasks is None:
+        return robot
+
+    def with_tasks(rewards: Any) -> "Robot":
+        if not isinstance(rewards, Mapping):
+            kind = type(rewards).__name__
+            raise TypeError(f"it must return rewards by name, got {kind}")
+        return _checked(robot._replace(tasks=envs.tasks_of(rewards)))
+
+    return user_files.made("--tasks", tasks, "tasks", with_tasks)
+
+
+def listing(engine: str) -> str:
+    """Returns a line per robot: name, sizes and tasks."""
+    from jaxpets import envs
+
+    robots = [named(name, engine) for name in envs.names()]
+    lines = [("name", "observation", "action", "tasks")]
+    lines += [
+        (robot.name, *map(str, sizes(robot)), ", ".join(robot.tasks.names))
+        for robot in robots
+    ]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)][:-1]
+    return "\n".join(
+        "  ".join([*(x.ljust(w) for x, w in zip(line, widths, strict=False)), line[-1]])
+        for line in lines
+    )
+
+
+def sizes(robot: "Robot") -> tuple[int, int]:
+    """Returns D and A."""
+    start = jax.eval_shape(robot.env.reset, jax.random.key(0))
+    return start.obs.shape[0], robot.env.action_low.shape[0]
+
+
+def chosen(config: Config, robot: "Robot") -> "Tasks":
+    """Returns the tasks that phase 2 is about, K of the robot's."""
+    every = robot.tasks
+    tasks = every if config.task == "all" else every._replace(names=(config.task,))
+    ids = jnp.asarray(places(robot, tasks))
+    return tasks._replace(params=jax.tree.map(lambda x: x[ids], every.params))
+
+
+def places(robot: "Robot", tasks: "Tasks") -> list[int]:
+    """Returns where tasks stand among all of the robot."""
+    return [robot.tasks.names.index(name) for name in tasks.names]
+
+
+def check_tasks(config: Config, robot: "Robot") -> None:
+    """Refuses a task that the robot does not have, and a tag that is one of its tasks.
+
+    Raises:
+      UsageError: naming the flag.
+    """
+    names = ("all", *robot.tasks.names)
+    if config.task not in names:
+        valid = f"it must be {', '.join(names)}"
+        raise UsageError(f"--task {config.task} is not valid; {valid}.")
+    if config.tag in names:
+        valid = "it must be something else; it is a task"
+        raise UsageError(f"--tag {config.tag} is not valid; {valid}.")
+
+
+def _checked(robot: Any) -> "Robot":
+    """Returns what is a robot: one that can be reset, stepped, modelled and scored."""
+    from jaxpets import envs
+
+    if not isinstance(robot, envs.Robot):
+        kind = type(robot).__name__
+        raise TypeError(f"it must return a jaxpets.envs.Robot, got {kind}")
+    names = robot.tasks.names
+    for name in names:
+        try:
+            rundir.check_name(name)
+        except UsageError as error:
+            raise ValueError(str(error).replace("run", "task", 1)) from None
+    if "all" in names or len(set(names)) < len(names):
+        raise ValueError(f"tasks must have names of their own, not all, got {names}")
+    jax.eval_shape(functools.partial(_trial, robot), jax.random.key(0))
+    return robot
+
+
+def _trial(robot: "Robot", key: jax.Array) -> Any:
+    """Does one step of everything that a run does with a robot."""
+    from jaxpets import envs
+
+    env, space = robot.env, robot.space
+    planner = jaxpets.random_planner(env.action_low, env.action_high)
+    state = jaxpets.start_trial(env, planner, key)
+    nothing = jaxpets.PlanParams(())
+    state, seen, _ = jaxpets.unroll(env, planner, nothing, key, state, length=1)
+    features, target = space.features(seen.obs), space.target(seen.obs, seen.next_obs)
+    known = (
+        space.next_obs(seen.obs, target),
+        space.bound(seen.obs, seen.obs[0], seen.obs[0]),
+    )
+
+    def reward(task: Any) -> jax.Array:
+        params = envs.with_constants(task, state.env.constants)
+        planned = jaxpets.rewards.score(robot.tasks.reward_fn, params, seen)
+        return planned + robot.tasks.reward_fn(params, *seen)
+
+    rewards = jax.vmap(reward)(robot.tasks.params)
+    if rewards.shape != (len(robot.tasks.names), 1):
+        raise ValueError(
+            "the reward of tasks must be [...] for observations [..., D], with a row "
+            f"of params for each name, got {rewards.shape} for {len(robot.tasks.names)}"
+            " tasks of one step"
+        )
+    shown = [seen.obs[:, axis.entry] for axis in robot.axes]
+    return features, known, rewards, jnp.asarray(shown)

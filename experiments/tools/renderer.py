@@ -1,0 +1,72 @@
+"""What draws a robot, frame by frame, with MuJoCo and OpenGL."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Look(NamedTuple):
+    """Size in pixels and frames per second."""
+
+    width: int = 640
+    height: int = 360
+    fps: int = 20  # the environment's steps a second: real time
+
+
+Draw = Callable[[np.ndarray], np.ndarray]  # qpos [Q] -> picture [height, width, 3]
+
+
+def open_renderer(model: Any, look: Look) -> Draw:
+    """Returns what draws a robot; fails, in many ways, where OpenGL does not work."""
+    import mujoco
+
+    gl: Any = mujoco  # its stubs lack half of it
+    model.vis.global_.offwidth, model.vis.global_.offheight = look.width, look.height
+    renderer, data = gl.Renderer(model, look.height, look.width), gl.MjData(model)
+    camera, period = _camera(model), _floor_period(model)
+
+    def draw(qpos: np.ndarray) -> np.ndarray:
+        data.qpos[:] = qpos
+        if period is not None:
+            data.qpos[0] %= period
+        gl.mj_forward(model, data)
+        renderer.update_scene(data, camera=camera)
+        return renderer.render()
+
+    return draw
+
+
+def _camera(model: Any) -> Any:
+    """Returns the camera of the model, or one that follows its first body.
+
+    One that is called `track` comes before others.
+    """
+    import mujoco
+
+    gl: Any = mujoco
+    if model.ncam:
+        names = [model.camera(i).name for i in range(model.ncam)]
+        return names.index("track") if "track" in names else 0
+    camera = gl.MjvCamera()
+    camera.type, camera.trackbodyid = gl.mjtCamera.mjCAMERA_TRACKING, model.nbody > 1
+    camera.distance = 2.0 * model.stat.extent
+    return camera
+
+
+def _floor_period(model: Any) -> float | None:
+    """Returns by how many m the floor looks the same; None where the robot is fixed.
+
+    A good runner leaves the floor and the light. The floor's pattern repeats, so a
+    robot put back by whole periods looks the same and stays in the middle.
+    """
+    import mujoco
+
+    gl: Any = mujoco
+    geoms = {model.geom(i).name: model.geom(i) for i in range(model.ngeom)}
+    floor, root = geoms.get("floor"), model.joint(0)
+    slides = root.type[0] == gl.mjtJoint.mjJNT_SLIDE and root.axis[0] == 1
+    if floor is None or floor.matid[0] < 0 or not slides or root.limited[0]:
+        return None
+    period = 2.0 * floor.size[0] / model.mat(floor.matid[0]).texrepeat[0]
+    return float(period) or None

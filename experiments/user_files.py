@@ -1,0 +1,76 @@
+"""Files of the user's, named as FILE.py or FILE.py:NAME: a robot, tasks, an objective.
+
+They run because a command line names them. The config of a run, which may come from a
+stranger, is never reason enough; see `cli`.
+"""
+
+import contextlib
+import os
+import re
+import runpy
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from experiments.errors import UsageError, reason
+
+T = TypeVar("T")
+_FORM = re.compile(r"(.+\.py)(?::(\w+))?", re.DOTALL)
+
+
+def is_file(text: str | None) -> bool:
+    """Returns whether a text names a file."""
+    return _FORM.fullmatch(text or "") is not None
+
+
+def made(
+    flag: str, text: str, name: str, check: Callable[[Any], T], *args: Any
+) -> T:  # fmt: skip
+    """Runs a file, calls a function of it, and returns what `check` makes of that.
+
+    Args:
+      flag: that named the file.
+      text: FILE.py or FILE.py:NAME.
+      name: of the function, where the text does not say it.
+      check: of what the function returns; raises what is wrong with it.
+      *args: of the function.
+
+    Raises:
+      UsageError: in one line with file, line and reason, whatever goes wrong.
+    """
+    form = _FORM.fullmatch(text)
+    if form is None:
+        raise _refused(flag, text, "it must be FILE.py or FILE.py:NAME")
+    file, name = form[1], form[2] or name
+    if not Path(file).is_file():
+        raise _refused(flag, text, "there is no such file")
+    with _blamed(flag, text, file, 1):
+        function = runpy.run_path(file).get(name)
+    if not callable(function):
+        raise _refused(flag, text, f"{file} has no function {name}")
+    code = getattr(function, "__code__", None)
+    with _blamed(flag, text, file, code.co_firstlineno if code else 1):
+        return check(function(*args))
+
+
+@contextlib.contextmanager
+def _blamed(flag: str, text: str, file: str, line: int) -> Iterator[None]:
+    """Names the line of a file that an error came by, or else this one."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [x.lineno for x in frames if _is_same(x.filename, file) and x.lineno]
+        if isinstance(error, SyntaxError) and _is_same(error.filename, file):
+            own.append(error.lineno or line)
+        place = f"{file}:{own[-1] if own else line}"
+        raise _refused(flag, text, f"{place}: {reason(error)}") from error
+
+
+def _is_same(one: str | None, other: str) -> bool:
+    return one is not None and os.path.realpath(one) == os.path.realpath(other)
+
+
+def _refused(flag: str, text: str, why: str) -> UsageError:
+    return UsageError(f"{flag} {text} is not valid; {why.rstrip('.')}.")

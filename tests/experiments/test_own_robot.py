@@ -1,0 +1,196 @@
+"""A robot, tasks and an objective of the user's, through every phase."""
+
+import json
+
+import jax
+import numpy as np
+import own_robot
+import pytest
+import runs
+
+from experiments import cli, robots
+from experiments.build import build
+from experiments.errors import UsageError
+from experiments.report import style
+from experiments.run import main
+from experiments.storage import rundir
+from jaxpets import envs
+
+FILE = own_robot.__file__
+ROBOT = ("--env", FILE)
+ARM = ("--arm", f"{FILE}:novelty")
+TINY = (
+    "--preset", "smoke", "--engine", "mujoco", "--model.num-members", "2",
+    "--model.hidden-size", "8", "--model.num-layers", "1", "--num-trials", "2",
+    *(f"--{name}.{flag}" for name in ("planner", "task-planner")
+      for flag in ("no-fused", "horizon=2", "num-particles=2", "num-iterations=1")),
+)  # fmt: skip
+NAME = "smoke-own_robot-own_robot-novelty"
+TUNED = "finetune-002-own_robot"
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    """Explored, performed the robot's tasks, tuned one of a file, reported."""
+    out = tmp_path_factory.mktemp("out")
+    assert main(["explore", *ROBOT, *ARM, *TINY, "--out", str(out)]) == 0
+    later = ("--from", str(out / NAME), *ROBOT, *ARM)
+    assert main(["zero-shot", *later, "--eval-trials", "2"]) == 0
+    tune = ("--tasks", FILE, "--finetune-trials", "1")
+    assert main(["finetune", *later, *tune]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(style.STYLE, "savefig.dpi", 30)
+        assert main(["report", "--out", str(out)]) == 0
+    return out
+
+
+def test_exploration_is_logged_with_the_tasks_of_the_robot(out):
+    first, second = runs.rows(out / NAME)
+    assert (first["arm"], first["planner"]) == ("own_robot-novelty", "random")
+    assert set(first["returns"]) == {"reach", "spin"}
+    assert second["value"] > 0.0 and np.isfinite(second["turns"])
+    goals = [row["constants/goal"] for row in (first, second)]
+    assert goals[0] != goals[1] and max(map(abs, goals)) <= 1.0
+
+
+def test_coverage_has_the_axes_of_the_robot(out):
+    found = json.loads((out / NAME / "coverage.json").read_text())
+    assert found["units"] == ["m", "rad/s"]
+    counts = np.array(found["counts"]["0"])
+    assert counts.shape == (4, 2) and counts.sum() == 2 * runs.STEPS
+
+
+def test_a_trial_is_scored_by_what_was_drawn_for_it(out):
+    """By the file of trajectories, for a zero-shot and for the last tuned trial."""
+    for folder, task in (("zero-shot-002", "reach"), (TUNED, "near")):
+        paths = dict(np.load(out / NAME / folder / "trajectories.npz"))
+        place = paths["obs"][0, 0, ..., 0]
+        goal = paths["constants/goal"][0, 0]
+        want = -np.abs(place - goal[:, None]).sum(-1)
+        np.testing.assert_allclose(paths["returns"][0, 0], want, rtol=1e-5)
+        logged = [x for x in runs.rows(out / NAME / folder) if x["task"] == task]
+        np.testing.assert_allclose([row["return"] for row in logged], want, rtol=1e-5)
+        assert [row["constants/goal"] for row in logged] == goal.tolist()
+
+
+def test_tasks_of_a_file_stand_beside_those_of_the_robot(out):
+    (row,) = runs.rows(out / NAME / TUNED)
+    assert (row["task"], set(row["returns"])) == ("near", {"near"})
+    table = json.loads((out / "report" / "table1.json").read_text())
+    assert list(table["own_robot-novelty"]) == ["reach", "spin"]
+    text = (out / "report" / "report.md").read_text()
+    assert "| near | no log |" in text and "\nnear:\n" in text
+
+
+def test_the_report_is_of_the_robot_alone(out):
+    text = (out / "report" / "report.md").read_text()
+    assert text.startswith("# Report of preset `smoke-own_robot`\n")
+    assert "paper: " not in text and "forward" not in text and "Flips" not in text
+    assert "4 bins of 1 m (place) by 2 bins of 10 rad/s (rate)" in text
+    assert {"figure4.png", "coverage.png"} <= {
+        path.name for path in (out / "report").iterdir()
+    }
+
+
+@pytest.mark.parametrize("wanted", [ROBOT, ARM])
+def test_a_file_runs_only_if_the_command_names_it(out, capsys, wanted):
+    """And not because the folder of a run does, which may be a stranger's."""
+    said = {*ROBOT, *ARM} - {*wanted}
+    flags = [x for pair in (ROBOT, ARM) for x in pair if said >= {*pair}]
+    assert main(["zero-shot", "--from", str(out / NAME), *flags]) == 2
+    assert f"runs only if you name it: {' '.join(wanted)}." in capsys.readouterr().err
+
+
+WRONG = {
+    "def robot(backend:": "1: SyntaxError: ",
+    "import os\n\nraise ValueError('far\\nout')": "3: ValueError: far.",
+    "import sys\nsys.exit(1)": "2: SystemExit: 1.",
+    "def act():\n    pass": "has no function robot.",
+    "robot = 3": "has no function robot.",
+    "\ndef robot(backend):\n    return 3": "2: TypeError: it must return a jaxpets.en",
+    "def robot():\n    return 3": "1: TypeError: robot() takes 0 positional arguments",
+    "def robot(backend):\n    return 1 / 0": "2: ZeroDivisionError: division by zero.",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_file_that_is_no_robot_is_one_line(tmp_path, capsys, text):
+    file, out = tmp_path / "bad.py", tmp_path / "out"
+    file.write_text(text)
+    assert main(["explore", "--env", str(file), "--out", str(out)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: --env {file} is not valid; {file}")
+    assert WRONG[text] in line and not out.exists()
+
+
+BAD_TASKS = {
+    "return {}": "rewards must have a task, got none",
+    "return [1]": "it must return rewards by name, got list",
+    "return {'all': lambda c, o, a, n: n[..., 0]}": "names of their own, not all",
+    "return {'a/b': lambda c, o, a, n: n[..., 0]}": "task 'a/b' is not a valid name",
+    "return {'far': lambda c, o, a, n: n[..., 0] - c.goal}": "2: AttributeError: ",
+    "return {'wide': lambda c, o, a, n: n}": "1: ValueError: reward_fn must return",
+}
+
+
+@pytest.mark.parametrize("text", BAD_TASKS)
+def test_tasks_that_are_none_are_one_line(tmp_path, text):
+    file = tmp_path / "bad.py"
+    file.write_text(f"def tasks():\n    {text}")
+    with pytest.raises(UsageError) as error:
+        robots.named(FILE, "mujoco", str(file))
+    assert str(error.value).startswith(f"--tasks {file} is not valid; {file}:")
+    assert BAD_TASKS[text] in str(error.value)
+
+
+BAD_ARMS = {
+    "return 3": "1: TypeError: it must return (RewardFn, RewardData), got 3.",
+    "return (lambda d, o, a, n: n / 0 * d.x), RewardData()": "3: AttributeError: ",
+    "return (lambda d, o, a, n: n), RewardData()": "reward_fn must return shape",
+}
+
+
+@pytest.mark.parametrize("text", BAD_ARMS)
+def test_an_objective_that_is_none_is_one_line(tmp_path, text):
+    file = tmp_path / "bad.py"
+    file.write_text(f"def arm(model):\n    from jaxpets import RewardData\n    {text}")
+    with pytest.raises(UsageError) as error:
+        cli.parse(["explore", *ROBOT, *TINY, "--arm", f"{file}:arm"])
+    assert BAD_ARMS[text] in str(error.value)
+
+
+@pytest.mark.parametrize("arm", ["oracle", "mixture"])
+def test_an_arm_that_seeks_a_task_gets_the_constants_of_the_trial(arm):
+    config = cli.parse(["explore", *ROBOT, *TINY, "--arm", arm])
+    parts, goal = build(config), {"goal": jax.ShapeDtypeStruct((), "float32")}
+    before = jax.eval_shape(parts.learner.init, jax.random.key(0)).reward
+    after = parts.bind(before, goal)
+    if arm == "mixture":
+        before, after = before.extrinsic, after.extrinsic
+    assert after == envs.with_constants(before, goal)
+
+
+def test_robots_are_listed(capsys):
+    assert main(["--list", "envs"]) == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["name", "observation", "action", "tasks"]
+    assert [line.split()[0] for line in lines] == list(envs.names())
+    assert "18" in lines[0] and lines[0].endswith("front-flip, back-flip")
+    assert main(["--list", "arms"]) == 2
+    assert "--list arms is not valid; it must be envs." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "label"),
+    [
+        ("dmc/walker", "dmc-walker"),
+        ("gym/Hopper-v5", "gym-Hopper-v5"),
+        ("my_robot.py", "my_robot"),
+        ("../a b/my_robot.py:other", "my_robot-other"),
+        ("info-gain", "info-gain"),
+        ("../\x1b/x", "x"),
+    ],
+)
+def test_what_folders_call_it(text, label):
+    assert rundir.label(text) == label
+    rundir.check_name(label)
