@@ -6,18 +6,15 @@ positions where the geometry is simple and exact, else from an entry that carrie
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.types import RewardFn
+from jaxpets.envs.recipe import Entry, Rewards
 from jaxpets.envs.tolerance import linear, quadratic, tolerance
-
-# `(entry's name) -> its place in the observation`.
-Entry = Callable[[str], int]
-Rewards = Mapping[str, RewardFn]
 
 _SPIN_RATE = 10.0  # rad/s, of a flip; ours
 _TORSO_SPEED = "sensordata/torso_subtreelinvel.x"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from jaxpets._src.checks import nearest
 from jaxpets.envs import half_cheetah
 from jaxpets.envs.dmc import DOMAINS, dmc
+from jaxpets.envs.gym import ROBOTS, gym
 from jaxpets.envs.robot import Axis, Robot, Tasks
 
 _VELOCITY_EDGES = tuple(i / 2 for i in range(-16, 17))  # m/s
@@ -63,4 +64,5 @@ def _half_cheetah(backend: str) -> Robot:
 _MAKERS: dict[str, Callable[[str], Robot]] = {
     "pets/half_cheetah": _half_cheetah,
     **{f"dmc/{name}": functools.partial(dmc, name) for name in DOMAINS},
+    **{f"gym/{name}": functools.partial(gym, name) for name in ROBOTS},
 }

@@ -47,7 +47,9 @@ def test_a_missing_robot_names_the_extra(without):
 
 def test_a_missing_suite_names_its_own_extra(without):
     without("dm_control")
-    with pytest.raises(ImportError, match=r"needs the extra jaxpets\[dmc\] .*dm_control"):
+    with pytest.raises(
+        ImportError, match=r"needs the extra jaxpets\[dmc\] .*dm_control"
+    ):
         jaxpets.envs.make("dmc/walker")
 
 

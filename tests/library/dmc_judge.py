@@ -2,12 +2,11 @@
 
 As a script it does so at length, and prints the largest differences:
 
-    PYTHONPATH=.:tests/library python tests/library/judge.py [mjx] [name ...]
+    PYTHONPATH=.:tests/library python tests/library/dmc_judge.py [mjx] [name ...]
 """
 
 import os
 import sys
-from typing import NamedTuple
 
 os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is drawn
 
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import parity
 from dm_control.mujoco.wrapper.mjbindings import sizes
 
 from jaxpets import envs
@@ -38,23 +38,6 @@ MIRRORED = {
 OURS = ("jump", "front-flip", "back-flip")
 
 
-class Differences(NamedTuple):
-    """The largest differences over all steps, and how many steps there were.
-
-    `position` and `velocity` are of qpos and qvel, `act` of activations, relative to
-    the largest number in the array, or 1. `reward` is that of a step over its repeats,
-    and `flipped` counts the steps at which a reward of all or nothing differs.
-    """
-
-    steps: int
-    position: float
-    velocity: float
-    act: float
-    reward: float
-    flipped: int
-    positive: dict
-
-
 class Judge:
     """One domain of dm_control, put into any state."""
 
@@ -72,6 +55,7 @@ class Judge:
         self.physics = self.env.physics
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
         assert self.env.control_timestep() == domain.control_step
+        self.num_substeps = round(domain.control_step / self.model.opt.timestep)
 
     def put(self, physics):
         """Puts a state of ours in."""
@@ -85,13 +69,14 @@ class Judge:
     def step(self, action):
         """Steps as its environment does, as often as an action is held."""
         for _ in range(self.repeat):
-            self.env.task.before_step(np.asarray(action, np.float64), self.physics)
-            self.physics.step(
-                round(self.env.control_timestep() / self.model.opt.timestep)
-            )
+            self.env.task.before_step(action, self.physics)
+            self.physics.step(self.num_substeps)
 
-    def reward(self, task, constants):
+    def reward(self, task, constants, action):
         """Returns the reward of the state it is in, mirrored where ours is."""
+        del action
+        if task in OURS:
+            return None
         own = self.envs[MIRRORED.get(task, task)].task
         named = self.physics.named.model
         if task in ("easy", "hard"):
@@ -117,8 +102,11 @@ def near_rest(model, key, physics):
     """Returns a state close to the model's own posture, fast or slow.
 
     That is where most tasks are fulfilled, and random actions hardly ever lead. In two
-    domains it is elsewhere: the ball is in the cup, the spinner spins.
+    domains it is elsewhere: the ball is in the cup, the spinner spins. A free joint
+    stays as it is.
     """
+    if model.nq != model.nv:
+        return physics
     speed_key, scale_key = jax.random.split(key)
     scale = 20 * jax.random.uniform(scale_key, (), jnp.float32) ** 2
     qpos = jnp.asarray(model.qpos0, jnp.float32)
@@ -132,76 +120,11 @@ def near_rest(model, key, physics):
     return physics._replace(qpos=qpos, qvel=qvel)
 
 
-def rolled(robot, num_trials, num_steps, seed=0):
-    """Random trials: states before and after, actions, and rewards of all tasks.
-
-    The second half of them starts near rest, where joints are plain numbers.
-    """
-    env, tasks, model = robot.env, robot.tasks, robot.model
-
-    def trial(key, is_near):
-        start_key, strength_key, near_key, key = jax.random.split(key, 4)
-        strength = jax.random.uniform(strength_key, (), jnp.float32)
-        start = env.reset(start_key)
-        if model.nq == model.nv:
-            near = near_rest(model, near_key, start.physics)
-            physics = jax.tree.map(
-                lambda a, b: jnp.where(is_near, a, b), near, start.physics
-            )
-            start = start._replace(physics=physics)
-
-        def step(state, key):
-            noise = jax.random.uniform(key, env.action_low.shape, jnp.float32)
-            action = env.action_low + noise * (env.action_high - env.action_low)
-            after = env.step(state, strength * action)
-
-            def reward(row):
-                params = envs.with_constants(row, state.constants)
-                return tasks.reward_fn(params, state.obs, strength * action, after.obs)
-
-            rewards = jax.vmap(reward)(tasks.params)
-            return after, (state, strength * action, after, rewards)
-
-        return jax.lax.scan(step, start, jax.random.split(key, num_steps))[1]
-
-    keys = jax.random.split(jax.random.key(seed), num_trials)
-    is_near = 2 * jnp.arange(num_trials) >= num_trials
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(trial))(keys, is_near))
-
-
 def differences(robot, num_trials, num_steps):
-    """Steps the judge from each state of random trials, with the same action."""
-    name = robot.name.removeprefix("dmc/")
-    judge = Judge(name, robot.tasks.names)
-    before, actions, after, rewards = rolled(robot, num_trials, num_steps)
-    worst = {"qpos": 0.0, "qvel": 0.0, "act": 0.0, "reward": 0.0}
-    positive = dict.fromkeys(robot.tasks.names, 0)
-    flipped = 0
-    for place in np.ndindex(num_trials, num_steps):
-        physics, reached = (
-            jax.tree.map(lambda x, place=place: x[place], state.physics)
-            for state in (before, after)
-        )
-        judge.put(physics)
-        judge.step(actions[place])
-        for field in ("qpos", "qvel", "act"):
-            want, got = np.array(getattr(judge.data, field)), getattr(reached, field)
-            if want.size:
-                error = np.abs(got - want).max() / max(1.0, np.abs(want).max())
-                worst[field] = max(worst[field], float(error))
-        constants = before.constants
-        constants = constants[place] if isinstance(constants, np.ndarray) else ()
-        for i, task in enumerate(robot.tasks.names):
-            positive[task] += bool(rewards[place][i] > 0)
-            if task in OURS:
-                continue
-            want = np.float64(judge.reward(task, constants))
-            error = abs(rewards[place][i] / judge.repeat - want)
-            if error > 0.5 and want in (0.0, 1.0):
-                flipped += 1
-            else:
-                worst["reward"] = max(worst["reward"], float(error))
-    return Differences(num_trials * num_steps, *worst.values(), flipped, positive)
+    """Returns how far a domain of ours is from dm_control's, and the trials of it."""
+    judge = Judge(robot.name.removeprefix("dmc/"), robot.tasks.names)
+    trials = parity.rolled(robot, num_trials, num_steps, near_rest)
+    return parity.differences(robot, judge, trials), trials
 
 
 def main(argv):
@@ -210,8 +133,8 @@ def main(argv):
     for name in names:
         robot = envs.make(f"dmc/{name}", backend=backend)
         many = 1000 if backend == "mujoco" else 40
-        long = differences(robot, 1, many // DOMAINS[name].action_repeat)
-        wide = differences(robot, many // 2, 2)
+        long, _ = differences(robot, 1, many // DOMAINS[name].action_repeat)
+        wide, _ = differences(robot, many // 2, 2)
         print(name, long, wide, sep="\n  ", flush=True)
 
 
