@@ -20,11 +20,13 @@ class Physics(NamedTuple):
       qpos: `[Q]`, positions in m and rad, and quaternions.
       qvel: `[V]`, velocities in m/s and rad/s.
       qacc_warmstart: `[V]`, where the contact solver starts.
+      act: `[M]`, activations of actuators that have one; () where none has.
     """
 
     qpos: Array
     qvel: Array
     qacc_warmstart: Array
+    act: Any = ()
 
 
 class Engine(NamedTuple):
@@ -88,12 +90,13 @@ def mjx_engine(
     subtree_vel = cast(Callable[[Any, Any], Any], mjx.subtree_vel)
 
     def data_of(physics: Physics, action: Array) -> Any:
-        return template.replace(
+        data = template.replace(
             qpos=physics.qpos,
             qvel=physics.qvel,
             qacc_warmstart=physics.qacc_warmstart,
             ctrl=action,
         )
+        return data.replace(act=physics.act) if model.na else data
 
     def substep(_: Array, data: Any) -> Any:
         return mjx_step(device_model, data)
@@ -102,7 +105,8 @@ def mjx_engine(
         data = data_of(before, action)
         with _as_mjx_needs():
             data = cast(Any, jax.lax.fori_loop(0, num_substeps, substep, data))
-        return Physics(data.qpos, data.qvel, data.qacc_warmstart)
+        act = data.act if model.na else ()
+        return Physics(data.qpos, data.qvel, data.qacc_warmstart, act)
 
     def read(physics: Physics, action: Array) -> Array:
         with _as_mjx_needs():

@@ -1,12 +1,15 @@
-"""What is said where a package of the extra `envs` is missing."""
+"""What is said where a package of an extra is missing."""
 
 import contextlib
 from collections.abc import Generator
 
 
 @contextlib.contextmanager
-def needs_extra() -> Generator[None, None, None]:
+def needs_extra(extra: str = "envs") -> Generator[None, None, None]:
     """Names the extra if an import in its block fails.
+
+    Args:
+      extra: its name in `jaxpets[...]`.
 
     Raises:
       ImportError: with the command that installs what is missing.
@@ -15,6 +18,6 @@ def needs_extra() -> Generator[None, None, None]:
         yield
     except ImportError as error:
         raise ImportError(
-            f"this environment needs the extra jaxpets[envs] ({error}); install it "
-            "with: pip install 'jaxpets[envs]'"
+            f"this environment needs the extra jaxpets[{extra}] ({error}); install it "
+            f"with: pip install 'jaxpets[{extra}]'"
         ) from error

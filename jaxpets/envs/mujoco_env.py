@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +21,12 @@ with needs_extra():
 
 _C: Any = mujoco  # its names are made at import, where pyright does not see them
 _RESET_STD = 0.001  # as PETS starts HalfCheetah
-_STATE = ("mean_qvel", "qpos", "qvel")
+_STATE = ("mean_qvel", "qpos", "qvel", "act")
 
 # `(key) -> (qpos [Q], qvel [V])`.
 ResetFn = Callable[[Array], tuple[Array, Array]]
+# `(key) -> constants`, any pytree.
+ConstantsFn = Callable[[Array], Any]
 
 
 def mujoco_env(
@@ -35,6 +37,8 @@ def mujoco_env(
     action_repeat: int = 1,
     reset: ResetFn | Sequence[str] | None = None,
     terminal_fn: Callable[[Array], Array] | None = None,
+    settle_time: float = 0.0,
+    constants: ConstantsFn | None = None,
     backend: str = "mujoco",
     num_threads: int | None = None,
 ) -> Env:
@@ -62,6 +66,10 @@ def mujoco_env(
         own start. All but the function's are within 0.001 of what was named.
       terminal_fn: `(obs [..., D]) -> bool [...]`, whether a trial ends there; None for
         never.
+      settle_time: for how long physics goes on from there, with controls of zero, until
+        a trial begins, in s; a multiple of the environment's step.
+      constants: `(key) -> constants` of a trial, as the place of a target, which are in
+        EnvState for rewards to read; physics knows nothing of them.
       backend: "mujoco", C on the cores of the host, for up to a hundred environments;
         or "mjx", JAX on the device, with the same physics in float32.
       num_threads: of "mujoco", over which a batch is spread; by default all cores.
@@ -80,6 +88,8 @@ def mujoco_env(
     coordinates = space([reading.coordinate for reading in found]).coordinates
     low, high = _action_range(model)
     num_substeps = _num_substeps(model, control_step, action_repeat)
+    step_time = num_substeps * model.opt.timestep
+    num_settling = _num_settling(settle_time, step_time)
     places = [(r.source, r.place) for r in found if r.source not in _STATE]
     if backend == "mujoco":
         engine = native_engine(
@@ -90,21 +100,29 @@ def mujoco_env(
     else:
         raise ValueError(f'backend must be "mujoco" or "mjx", got {backend!r}.')
     start_fn = _start_fn(model, reset)
-    seen_fn = _seen_fn(model, found, engine, num_substeps * model.opt.timestep)
+    seen_fn = _seen_fn(model, found, engine, step_time)
 
     def begin(key: Array) -> EnvState:
         check_key("key", key)
+        drawn: Any = ()
+        if constants is not None:
+            key, constants_key = jax.random.split(key)
+            drawn = constants(constants_key)
         qpos, qvel = start_fn(key)
         check_array("the qpos of reset", qpos, [model.nq])
         check_array("the qvel of reset", qvel, [model.nv])
         still = jnp.zeros((model.nv,), jnp.float32)
-        physics = Physics(_unit_quaternions(model, qpos), qvel, still)
-        return EnvState(seen_fn(physics, physics, jnp.zeros_like(low)), physics)
+        act = jnp.zeros((model.na,), jnp.float32) if model.na else ()
+        physics = Physics(_unit_quaternions(model, qpos), qvel, still, act)
+        idle = jnp.zeros_like(low)
+        physics = _settled(engine, physics, idle, num_settling)
+        return EnvState(seen_fn(physics, physics, idle), physics, drawn)
 
     def step(state: EnvState, action: Array) -> EnvState:
         check_array("action", action, [model.nu])
         physics = engine.advance(state.physics, action)
-        return EnvState(seen_fn(state.physics, physics, action), physics)
+        obs = seen_fn(state.physics, physics, action)
+        return EnvState(obs, physics, state.constants)
 
     return Env(begin, step, low, high, coordinates, terminal_fn)
 
@@ -163,6 +181,28 @@ def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:
     return count * action_repeat
 
 
+def _num_settling(settle_time: float, step_time: float) -> int:
+    """Returns how many steps of the environment go before a trial."""
+    count = round(settle_time / step_time)
+    if settle_time < 0 or abs(settle_time - count * step_time) > 1e-6 * step_time:
+        raise ValueError(
+            f"settle_time must be a multiple of the {step_time:g} s of a step, "
+            f"got {settle_time!r}."
+        )
+    return count
+
+
+def _settled(engine: Engine, physics: Physics, idle: Array, count: int) -> Physics:
+    """Returns where physics has come to after some steps."""
+
+    def step(_: Array, before: Physics) -> Physics:
+        return engine.advance(before, idle)
+
+    if not count:
+        return physics
+    return cast(Physics, jax.lax.fori_loop(0, count, step, physics))
+
+
 def _start_fn(model: Any, reset: ResetFn | Sequence[str] | None) -> ResetFn:
     """Returns what draws the start of a trial."""
     if callable(reset):
@@ -205,8 +245,9 @@ def _seen_fn(
     model: Any, found: Sequence[Reading], engine: Engine, step_time: float
 ) -> Callable[[Physics, Physics, Array], Array]:
     """Returns `(physics before, physics, action) -> obs [D]`."""
-    starts = {"mean_qvel": 0, "qpos": model.nq, "qvel": 2 * model.nq}
-    end = 2 * model.nq + model.nv
+    act_start = 2 * model.nq + model.nv
+    starts = {"mean_qvel": 0, "qpos": model.nq, "qvel": 2 * model.nq, "act": act_start}
+    end = act_start + model.na
     places: list[int] = []
     num_read = 0
     for reading in found:
@@ -220,6 +261,8 @@ def _seen_fn(
     def seen(before: Physics, physics: Physics, action: Array) -> Array:
         mean_qvel = (physics.qpos - before.qpos) / step_time
         parts = [mean_qvel, physics.qpos, physics.qvel]
+        if model.na:
+            parts.append(physics.act)
         if num_read:
             parts.append(engine.read(physics, action))
         return jnp.concatenate(parts)[order]

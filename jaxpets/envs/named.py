@@ -1,9 +1,12 @@
 """Robots by the names under which people know them."""
 
+import functools
 from collections.abc import Callable
 
 from jaxpets._src.checks import nearest
 from jaxpets.envs import half_cheetah
+from jaxpets.envs.dmc import DOMAINS, dmc
+from jaxpets.envs.gym import ROBOTS, gym
 from jaxpets.envs.robot import Axis, Robot, Tasks
 
 _VELOCITY_EDGES = tuple(i / 2 for i in range(-16, 17))  # m/s
@@ -25,6 +28,7 @@ def make(name: str, *, backend: str = "mujoco") -> Robot:
     Raises:
       ValueError: if there is no such name; the nearest are said. Or for a backend that
         is none, or cannot step this robot.
+      ImportError: if the package that has its model is missing; it names the extra.
     """
     if name not in _MAKERS:
         near = ", ".join(nearest(name, names()) or names())
@@ -53,7 +57,12 @@ def _half_cheetah(backend: str) -> Robot:
         angle=half_cheetah.PITCH,
         model=half_cheetah.load_model(),
         qpos_fn=half_cheetah.qpos_from_obs,
+        camera="track",
     )
 
 
-_MAKERS: dict[str, Callable[[str], Robot]] = {"pets/half_cheetah": _half_cheetah}
+_MAKERS: dict[str, Callable[[str], Robot]] = {
+    "pets/half_cheetah": _half_cheetah,
+    **{f"dmc/{name}": functools.partial(dmc, name) for name in DOMAINS},
+    **{f"gym/{name}": functools.partial(gym, name) for name in ROBOTS},
+}

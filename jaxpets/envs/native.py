@@ -23,11 +23,12 @@ _INPUTS = int(
     _BITS.mjSTATE_TIME
     | _BITS.mjSTATE_QPOS
     | _BITS.mjSTATE_QVEL
+    | _BITS.mjSTATE_ACT
     | _BITS.mjSTATE_WARMSTART
     | _BITS.mjSTATE_CTRL
 )
-# `(qpos, qvel, qacc_warmstart, ctrl) -> (qpos, qvel, qacc_warmstart)`.
-PhysicsFn = Callable[[Array, Array, Array, Array], tuple[Array, Array, Array]]
+# `(qpos, qvel, qacc_warmstart, act, ctrl) -> (qpos, qvel, qacc_warmstart, act)`.
+PhysicsFn = Callable[[Array, Array, Array, Any, Array], tuple[Array, Array, Array, Any]]
 
 # To wake a thread takes about as long as two environment steps of HalfCheetah.
 _MIN_ROWS_PER_THREAD = 4
@@ -53,19 +54,23 @@ def native_physics(
       num_threads: at most this many; by default the cores this process may use.
 
     Returns:
-      `(qpos [Q], qvel [V], qacc_warmstart [V], ctrl [U])`, float32, to the first three
-      after the step. All are NaN where an input is not finite or where MuJoCo would
-      have reset the state: once it has blown up. It has no gradient.
+      `(qpos [Q], qvel [V], qacc_warmstart [V], act [M], ctrl [U])`, float32, to the
+      first four after the step; act is () where no actuator has an activation. All are
+      NaN where an input is not finite or where MuJoCo would have reset the state: once
+      it has blown up. It has no gradient.
 
     Raises:
       TypeError, ValueError: unless the counts are positive Python integers, and the
-        state of the model is its positions and velocities.
+        state of the model is its positions, velocities and activations.
     """
     check_count("num_substeps", num_substeps)
     c: Any = mujoco
-    if c.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != 1 + model.nq + model.nv:
-        raise ValueError("model must have no state but positions and velocities.")
-    ends = np.cumsum([model.nq, model.nv, model.nv]).tolist()
+    known = 1 + model.nq + model.nv + model.na
+    if c.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != known:
+        raise ValueError(
+            "model must have no state but positions, velocities and activations."
+        )
+    ends = np.cumsum([model.nq, model.nv, model.na, model.nv]).tolist()
     size = ends[-1]
 
     def visit(row: np.ndarray, data: Any) -> None:
@@ -77,17 +82,30 @@ def native_physics(
     run = _host_function(model, visit, size, num_threads)
 
     def step(
-        qpos: Array, qvel: Array, qacc_warmstart: Array, ctrl: Array
-    ) -> tuple[Array, Array, Array]:
-        outputs = run(qpos, qvel, qacc_warmstart, ctrl)
-        return outputs[: ends[0]], outputs[ends[0] : ends[1]], outputs[ends[1] :]
+        qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
+    ) -> tuple[Array, Array, Array, Any]:
+        outputs = run(*_packed(qpos, qvel, qacc_warmstart, act, ctrl))
+        return (
+            outputs[: ends[0]],
+            outputs[ends[0] : ends[1]],
+            outputs[ends[2] :],
+            outputs[ends[1] : ends[2]] if model.na else (),
+        )
 
     return step
 
 
+def _packed(
+    qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
+) -> list[Array]:
+    """Returns the inputs in the order in which MuJoCo packs them."""
+    activations = [act] if isinstance(act, Array) else []
+    return [qpos, qvel, *activations, qacc_warmstart, ctrl]
+
+
 def native_readings(
     model: Any, places: Sequence[tuple[str, int]], *, num_threads: int | None = None
-) -> Callable[[Array, Array, Array, Array], Array]:
+) -> Callable[[Array, Array, Array, Any, Array], Array]:
     """Builds what reads MuJoCo's data in a state: sensors, places, velocities.
 
     As `native_physics` it runs in C, once for a whole batch. Everything is of the state
@@ -99,8 +117,8 @@ def native_readings(
       num_threads: as there.
 
     Returns:
-      `(qpos [Q], qvel [V], qacc_warmstart [V], ctrl [U]) -> [R]`, float32; NaN where an
-      input is not finite.
+      `(qpos [Q], qvel [V], qacc_warmstart [V], act [M] or (), ctrl [U]) -> [R]`,
+      float32; NaN where an input is not finite.
     """
     c: Any = mujoco
     num_inputs = c.mj_stateSize(model, _INPUTS)
@@ -118,9 +136,16 @@ def native_readings(
         if "subtree_linvel" in arrays:
             c.mj_subtreeVel(model, data)
         for source, (outs, ins) in arrays.items():
-            row[outs] = getattr(data, source).reshape(-1)[ins]
+            row[outs] = np.ravel(getattr(data, source))[ins]
 
-    return _host_function(model, visit, size, num_threads)
+    run = _host_function(model, visit, size, num_threads)
+
+    def read(
+        qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
+    ) -> Array:
+        return run(*_packed(qpos, qvel, qacc_warmstart, act, ctrl))
+
+    return read
 
 
 def _host_function(

@@ -13,7 +13,7 @@ with needs_extra():
 
 _C: Any = mujoco  # its names are made at import, where pyright does not see them
 
-DEFAULT = ("mean_qvel", "qpos", "qvel")
+DEFAULT = ("mean_qvel", "qpos", "qvel", "act")
 """What is observed of a model of which nothing is said: where it is and how it moves.
 
 The velocity of a root over the whole step says how far it came, which the position of
@@ -45,9 +45,11 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
     A name is an array of MuJoCo, a slash, and what it is of: "qpos/rootz" or
     "qvel/rootz" with the name of a joint, "mean_qvel/rootx" (the finite difference over
     a step, of a slide or a hinge), "sensordata/foot", "site_xpos/tip", "xpos/torso",
-    "xmat/torso", "subtree_linvel/torso". Of what has several numbers, "xpos/torso" is
-    all and "xpos/torso.z" is one. An array alone is all of it, but: "qpos" leaves out
-    where the robot stands if nothing depends on it, and "mean_qvel" is of that alone.
+    "xipos/torso" (its centre of mass), "xmat/torso", "subtree_linvel/torso", and
+    "act/hip" with the name of an actuator that has an activation. Of what has several
+    numbers, "xpos/torso" is all and "xpos/torso.z" is one. An array alone is all of it,
+    but: "qpos" leaves out where the robot stands if nothing depends on it, and
+    "mean_qvel" is of that alone.
 
     How a model sees an entry follows from what it is: a hinge without limits is an
     angle, a ball is a quaternion, so is a free joint behind its place. What depends on
@@ -116,9 +118,11 @@ def _groups(model: Any, shifts: set[int]) -> dict[str, list[Reading]]:
         "mean_qvel": mean,
         "qpos": qpos,
         "qvel": qvel,
+        "act": [r for i in range(model.nu) for r in _activations(model, i)],
         "sensordata": [r for i in range(model.nsensor) for r in _sensor(model, i)],
         "site_xpos": _points(model, "site_xpos", "SITE", range(model.nsite), shifts),
         "xpos": _points(model, "xpos", "BODY", bodies, shifts),
+        "xipos": _points(model, "xipos", "BODY", bodies, shifts),
         "xmat": _arrays(model, "xmat", bodies, [a + b for a in _XYZ for b in _XYZ]),
         "subtree_linvel": _arrays(model, "subtree_linvel", bodies, _XYZ),
     }
@@ -170,6 +174,15 @@ def _velocities(model: Any, joint: int) -> list[Reading]:
         Reading("qvel", start + i, Coordinate(f"{name}.{part}" if part else name))
         for i, part in enumerate(parts)
     ]
+
+
+def _activations(model: Any, actuator: int) -> list[Reading]:
+    name = f"act/{_name(model, 'ACTUATOR', actuator)}"
+    start, size = (
+        int(x[actuator]) for x in (model.actuator_actadr, model.actuator_actnum)
+    )
+    names = [name] if size == 1 else [f"{name}.{i}" for i in range(size)]
+    return [Reading("act", start + i, Coordinate(n)) for i, n in enumerate(names)]
 
 
 def _sensor(model: Any, sensor: int) -> list[Reading]:

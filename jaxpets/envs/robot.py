@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.types import Env, ModelSpace, RewardFn
+from jaxpets._src.types import Env, EnvState, ModelSpace, RewardFn
 
 
 class Tasks(NamedTuple):
@@ -67,6 +67,9 @@ class Robot(NamedTuple):
       angle: the entry, unwrapped and in rad, of which net turns are counted, if any.
       model: the compiled MuJoCo model to draw it with, or None.
       qpos_fn: `(obs [T, D]) -> [T, Q]`, positions of a recorded trial to draw, or None.
+      camera: of the model, to draw it by; None is MuJoCo's own.
+      task_reset: `(a row of tasks.params, key) -> EnvState`, where trials of a task
+        start; None if all of them start as `env.reset` does.
     """
 
     name: str
@@ -77,6 +80,8 @@ class Robot(NamedTuple):
     angle: int | None = None
     model: Any = None
     qpos_fn: Callable[[Array], Array] | None = None
+    camera: str | None = None
+    task_reset: Callable[[Any, Array], EnvState] | None = None
 
 
 def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:

@@ -45,6 +45,14 @@ def test_a_missing_robot_names_the_extra(without):
         hc.load_model()
 
 
+def test_a_missing_suite_names_its_own_extra(without):
+    without("dm_control")
+    with pytest.raises(
+        ImportError, match=r"needs the extra jaxpets\[dmc\] .*dm_control"
+    ):
+        jaxpets.envs.make("dmc/walker")
+
+
 def test_the_bridges_need_nothing(without, monkeypatch):
     without("mujoco", "gymnasium", "brax")
     monkeypatch.delitem(sys.modules, "jaxpets.envs.adapters")

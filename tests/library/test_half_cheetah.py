@@ -210,8 +210,9 @@ def test_observation_is_velocity_positions_velocities(step):
 
 def test_state_has_no_reward(env):
     state = jax.eval_shape(env.reset, jax.random.key(0))
-    assert state._fields == ("obs", "physics")
-    assert state.physics._fields == ("qpos", "qvel", "qacc_warmstart")
+    assert state._fields == ("obs", "physics", "constants")
+    assert state.physics._fields == ("qpos", "qvel", "qacc_warmstart", "act")
+    assert state.constants == () and state.physics.act == ()
     np.testing.assert_array_equal(env.action_low, -np.ones(6))
     np.testing.assert_array_equal(env.action_high, np.ones(6))
 

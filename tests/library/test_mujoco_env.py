@@ -9,6 +9,7 @@ import robots
 
 import jaxpets
 from jaxpets import coordinates
+from jaxpets.coordinates import Coordinate
 from jaxpets.envs import half_cheetah as hc
 from jaxpets.envs import mujoco_env as module
 from jaxpets.envs.mujoco_env import mujoco_env
@@ -23,6 +24,11 @@ KEYS = (
     'qvel="1 0"/></keyframe></mujoco>'
 )
 CART = robots.CART_XML.replace("</mujoco>", KEYS)
+# The same cart, pushed by a motor that takes 0.1 s to do as it is told.
+SLOW_CART = CART.replace(
+    '<motor name="push"',
+    '<general name="push" dyntype="filter" dynprm="0.1" gainprm="1"',
+)
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +96,57 @@ def test_a_model_can_be_learned_in_its_coordinates(free, key):
 def test_one_step_on_mjx_is_that_of_c(key):
     observe = (*DEFAULT, "site_xpos/tip", "subtree_linvel/cart.x")
     native, mjx = (
-        mujoco_env(CART, observe=observe, control_step=0.01, backend=backend)
+        mujoco_env(SLOW_CART, observe=observe, control_step=0.01, backend=backend)
         for backend in ("mujoco", "mjx")
     )
     start, action = native.reset(key), jnp.full((1,), 0.5)
     got, want = (jax.jit(env.step)(start, action) for env in (mjx, native))
     # Five substeps in float32, without contacts.
     np.testing.assert_allclose(got.obs, want.obs, rtol=1e-4, atol=1e-5)
-    assert native.coordinates == mjx.coordinates and want.obs.shape == (8,)
+    assert native.coordinates == mjx.coordinates and want.obs.shape == (9,)
+    np.testing.assert_allclose(got.physics.act, want.physics.act, rtol=1e-6)
+
+
+def test_activations_are_state_and_are_observed(key):
+    env = mujoco_env(SLOW_CART, control_step=0.02, observe=("act/push", "qpos"))
+    model = mujoco.MjModel.from_xml_string(SLOW_CART)
+    data = mujoco.MjData(model)
+    before, action = env.reset(key), jnp.ones(1)
+    assert before.physics.act.shape == (1,) and before.obs[0] == 0.0
+    data.qpos[:], data.qvel[:] = before.physics.qpos, before.physics.qvel
+    data.ctrl[:] = 1.0
+    state = before
+    for step in range(1, 4):
+        mujoco.mj_step(model, data, 10)
+        state = env.step(state, action)
+        # The state goes through float32 at every step.
+        np.testing.assert_allclose(state.obs[0], data.act[0], rtol=1e-6)
+        np.testing.assert_allclose(state.physics.qvel, data.qvel, rtol=1e-5)
+        np.testing.assert_allclose(state.obs[0], 1 - np.exp(-0.2 * step), rtol=0.02)
+    row = env.coordinates[0]
+    assert row == Coordinate("act/push", "relative", True, True)
+    assert hc.half_cheetah_native().reset(key).physics.act == ()
+
+
+def test_a_trial_settles_and_has_constants(key):
+    def drawn(key):
+        return {"target": jax.random.uniform(key, (2,), jnp.float32)}
+
+    def tilted(key):
+        del key
+        return jnp.array([0.0, 0.5]), jnp.zeros(2)
+
+    options = {"control_step": 0.02, "reset": tilted}
+    env = mujoco_env(CART, **options, settle_time=0.06, constants=drawn)
+    plain = mujoco_env(CART, **options)
+    state, want = env.reset(key), plain.reset(key)
+    other = env.reset(jax.random.key(7)).constants["target"].tolist()
+    assert want.constants == () and other != state.constants["target"].tolist()
+    for _ in range(3):
+        want = plain.step(want, jnp.zeros(1))
+    jax.tree.map(np.testing.assert_array_equal, state.physics, want.physics)
+    after = env.step(state, jnp.ones(1))
+    assert after.constants["target"].tolist() == state.constants["target"].tolist()
 
 
 def test_an_action_is_held_for_its_repeats(key):
@@ -162,6 +211,12 @@ BAD = {
     ),
     "control_step must be a multiple of the model's 0.002 s, as 0.004, got 0.003": (
         CART, {"control_step": 0.003},
+    ),
+    "settle_time must be a multiple of the 0.02 s of a step, got 0.03": (
+        CART, {"control_step": 0.02, "settle_time": 0.03},
+    ),
+    "settle_time must be a multiple of the 0.02 s of a step, got -0.02": (
+        CART, {"control_step": 0.02, "settle_time": -0.02},
     ),
     "action_repeat must be at least 1": (CART, {"action_repeat": 0}),
     "reset must be keyframes among ..left., .right.., got .'up',.": (

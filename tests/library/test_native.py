@@ -69,7 +69,7 @@ def first(count, tree):
 
 
 def test_one_step_is_that_of_c_rounded_once(model, states, actions, after):
-    qpos, qvel, warmstart = (np.asarray(x) for x in states.physics)
+    qpos, qvel, warmstart = (np.asarray(x) for x in states.physics[:3])
     want, contacts = c_step(model, qpos, qvel, warmstart, np.asarray(actions))
     assert (contacts > 0).mean() > 0.5
     np.testing.assert_array_equal(after.physics.qpos, np.float32(want[0]))
@@ -90,7 +90,7 @@ def test_the_warm_start_goes_in_and_comes_out(states, actions):
     for i in range(0, STATES, 9):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (
-            x[i] for x in states.physics
+            x[i] for x in states.physics[:3]
         )
         data.ctrl[:] = actions[i]
         mujoco.mj_step(model, data, 2)
@@ -122,7 +122,7 @@ def test_state_keeps_its_avals(env):
 def test_what_is_not_finite_is_nan_and_stays_alone(env, states, actions, after):
     count = 8
     state, action = first(count, (states, actions))
-    qpos, qvel, warmstart = state.physics
+    qpos, qvel, warmstart, _ = state.physics
     physics = hc.Physics(
         qpos.at[0, 4].set(jnp.nan),
         qvel.at[1, 3].set(jnp.inf).at[2].set(1e9),  # C resets what is too fast
@@ -340,14 +340,16 @@ def test_bad_arguments(env, model):
 
 
 def test_a_model_with_more_state_is_refused():
-    muscle = mujoco.MjModel.from_xml_string(
+    late = mujoco.MjModel.from_xml_string(
         """<mujoco>
           <worldbody><body><joint name="hinge"/><geom size="1"/></body></worldbody>
-          <actuator><general joint="hinge" dyntype="integrator"/></actuator>
+          <actuator>
+            <general joint="hinge" delay="0.01" nsample="5"/>
+          </actuator>
         </mujoco>"""
     )
-    with pytest.raises(ValueError, match="model must have no state but positions"):
-        native.native_physics(muscle, num_substeps=1)
+    with pytest.raises(ValueError, match="no state but positions, velocities and act"):
+        native.native_physics(late, num_substeps=1)
 
 
 @pytest.mark.parametrize(("engine", "calls"), [("mjx", 0), ("mujoco", 1)])

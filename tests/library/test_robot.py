@@ -53,7 +53,7 @@ def test_tasks_are_one_reward_with_data():
 
 
 def test_what_is_no_robot_is_refused():
-    with pytest.raises(ValueError, match=r"as pets/half_cheetah, got 'half_cheeta'"):
+    with pytest.raises(ValueError, match=r"as pets/half_cheetah, .*got 'half_cheeta'"):
         envs.make("half_cheeta")
     with pytest.raises(ValueError, match='backend must be "mujoco" or "mjx", got 3'):
         envs.make("pets/half_cheetah", backend=3)

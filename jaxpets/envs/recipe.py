@@ -1,0 +1,140 @@
+"""A robot from a table: what is observed, earned and drawn of a MuJoCo model."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxpets._src.coordinates import index, space
+from jaxpets._src.types import Coordinate, Env, EnvState, RewardFn
+from jaxpets.envs.mujoco_env import ConstantsFn, ResetFn, mujoco_env
+from jaxpets.envs.robot import Axis, Robot, TrialParams, tasks_of
+from jaxpets.envs.tracks import qpos_fn
+
+# `(entry's name) -> its place in the observation`.
+Entry = Callable[[str], int]
+Rewards = Mapping[str, RewardFn]
+
+
+class Recipe(NamedTuple):
+    """What makes a robot of a model, as data.
+
+    Attributes:
+      file: of its MJCF where that comes from, without the suffix.
+      control_step: in s.
+      action_repeat: for how many of them an action is held.
+      observe: as `mujoco_env` takes it.
+      rewards: `(model, entry) -> rewards` by task, of one control step.
+      start: `(model) -> ResetFn`.
+      axes: name, unit, entry, and the ends of a histogram's bins, of two quantities.
+      camera: of the model, that follows the robot or sees all of it, if it has one.
+      angle: the entry of which turns are counted, if any.
+      settle_time: in s.
+      constants: `(model) -> ConstantsFn`, if trials have any.
+      task_starts: `(model) -> ResetFn`, and the tasks that start there instead.
+    """
+
+    file: str
+    control_step: float
+    action_repeat: int
+    observe: tuple[str, ...]
+    rewards: Callable[[Any, Entry], Rewards]
+    start: Callable[[Any], ResetFn]
+    axes: tuple[tuple[str, str, str, float], tuple[str, str, str, float]]
+    camera: str | None = None
+    angle: str | None = None
+    settle_time: float = 0.0
+    constants: Callable[[Any], ConstantsFn] | None = None
+    task_starts: tuple[tuple[Callable[[Any], ResetFn], tuple[str, ...]], ...] = ()
+
+
+def build(name: str, model: Any, recipe: Recipe, backend: str = "mujoco") -> Robot:
+    """Builds a robot.
+
+    A step holds its action for `action_repeat` control steps, and earns the reward of
+    the state that was reached, times as many.
+
+    Args:
+      name: as `envs.make` takes it.
+      model: a compiled MuJoCo model.
+      recipe: what to make of it.
+      backend: as `mujoco_env` takes it.
+
+    Raises:
+      ValueError: for a backend that is none, or cannot step the model.
+    """
+
+    def env_of(start: Callable[[Any], ResetFn]) -> Env:
+        return mujoco_env(
+            model,
+            observe=recipe.observe,
+            control_step=recipe.control_step,
+            action_repeat=recipe.action_repeat,
+            reset=start(model),
+            settle_time=recipe.settle_time,
+            constants=recipe.constants(model) if recipe.constants else None,
+            backend=backend,
+        )
+
+    env = env_of(recipe.start)
+    rows = env.coordinates
+    found = recipe.rewards(model, lambda entry: index(rows, entry))
+    elsewhere = [(env_of(start), tasks) for start, tasks in recipe.task_starts]
+    first, second = (_axis(rows, *axis) for axis in recipe.axes)
+    return Robot(
+        name=name,
+        env=env,
+        space=space(rows),
+        tasks=tasks_of(
+            {task: _repeated(found[task], recipe.action_repeat) for task in found}
+        ),
+        axes=(first, second),
+        angle=index(rows, recipe.angle) if recipe.angle else None,
+        model=model,
+        qpos_fn=qpos_fn(model, rows, recipe.control_step * recipe.action_repeat),
+        camera=recipe.camera,
+        task_reset=_task_reset(env, tuple(found), elsewhere) if elsewhere else None,
+    )
+
+
+def _task_reset(
+    env: Env, names: tuple[str, ...], elsewhere: Sequence[tuple[Env, tuple[str, ...]]]
+) -> Callable[[Any, Array], EnvState]:
+    """Returns how trials of a task start, as `Robot.task_reset`."""
+
+    def task_reset(params: Any, key: Array) -> EnvState:
+        task = params.task if isinstance(params, TrialParams) else params
+        state = env.reset(key)
+        for other, tasks in elsewhere:
+            numbers = np.array([names.index(name) for name in tasks], np.int32)
+            is_there = jnp.isin(task, numbers)
+            state = _where(is_there, other.reset(key), state)
+        return state
+
+    return task_reset
+
+
+def _where(condition: Array, a: EnvState, b: EnvState) -> EnvState:
+    def pick(x: Array, y: Array) -> Array:
+        return jnp.where(condition, x, y)
+
+    return jax.tree.map(pick, a, b)
+
+
+def _repeated(reward_fn: RewardFn, action_repeat: int) -> RewardFn:
+    """Returns the reward of a step of several control steps."""
+
+    def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        return action_repeat * reward_fn(params, obs, action, next_obs)
+
+    return reward
+
+
+def _axis(
+    rows: tuple[Coordinate, ...], name: str, unit: str, entry: str, end: float
+) -> Axis:
+    edges = tuple(end * i / 15 for i in range(-15, 16))
+    return Axis(name, unit, index(rows, entry), edges)
