@@ -24,7 +24,7 @@ Bind = Callable[[Any, Any], Any]
 class Actors(NamedTuple):
     """Jitted functions over the same leading axes.
 
-    start: `(keys) -> UnrollState`.
+    start: `(reward data, keys) -> UnrollState`.
     chunk: `(PlanParams, keys, UnrollState) -> (UnrollState, Transition, values)`.
     place: `(keys) -> keys`, takes those of all actors to where each of them acts.
     """
@@ -59,13 +59,13 @@ def explorers(
     placement: Placement, bind: Bind = lambda data, constants: data,
 ) -> Actors:  # fmt: skip
     """Returns actors over seeds `[S]`; params and reward data are per seed."""
-    start, chunk = _one(env, planner, horizon, length, bind)
+    start, chunk = _one(lambda _: env, planner, horizon, length, bind)
     params = jaxpets.PlanParams(P(SEED), P(SEED))
     return _actors(placement, jax.vmap(start), jax.vmap(chunk), params, SEED)
 
 
 def evaluators(
-    env: jaxpets.Env,
+    robot: Robot,
     planner: jaxpets.Planner,
     horizon: int,
     length: int,
@@ -78,12 +78,14 @@ def evaluators(
     The task's params are `[K]`. The model is `[S]` where all tasks share it, else
     `[S, K]`.
     """
-    start, chunk = _one(env, planner, horizon, length, with_constants)
+    env_of = functools.partial(_at_start, robot)
+    start, chunk = _one(env_of, planner, horizon, length, with_constants)
     model = None if shared_model else 0
     over_trials = jax.vmap(chunk, (None, 0, 0))
     over_tasks = jax.vmap(over_trials, (jaxpets.PlanParams(model, 0), 0, 0))
     over_seeds = jax.vmap(over_tasks, (jaxpets.PlanParams(0, None), 0, 0))
-    starts = jax.vmap(jax.vmap(jax.vmap(start)))
+    over_tasks_start = jax.vmap(jax.vmap(start, (None, 0)))
+    starts = jax.vmap(over_tasks_start, (None, 0))
     models = P(SEED) if shared_model else P(SEED, TASK)
     params = jaxpets.PlanParams(models, P(TASK))
     return _actors(placement, starts, over_seeds, params, *AXES)
@@ -109,7 +111,7 @@ def run(
       The trials of this host's actors, on its devices.
     """
     reset_keys, act_keys = map(actors.place, split_keys(keys))
-    state = actors.start(reset_keys)
+    state = actors.start(params.reward, reset_keys)
     chunks = []
     for _ in range(num_chunks):
         state, transitions, values = actors.chunk(params, act_keys, state)
@@ -123,11 +125,21 @@ def run(
     return Trials(transitions, values, state.env.constants)
 
 
-def constants(env: jaxpets.Env, keys: Array) -> Any:
-    """Returns what is drawn for the trials of these keys `[...]`, as `run` has it."""
-    reset_keys, _ = split_keys(keys)
-    drawn = jax.jit(jax.vmap(lambda key: env.reset(key).constants))(reset_keys.ravel())
-    return jax.tree.map(lambda x: x.reshape(*keys.shape, *x.shape[1:]), drawn)
+def constants(robot: Robot, tasks: Any, keys: Array) -> Any:
+    """Returns what is drawn for trials `[S, K, R]` of tasks `[K]`, as `run` has it."""
+
+    def drawn(task: Any, key: Array) -> Any:
+        return _at_start(robot, task).reset(key).constants
+
+    of_task = jax.vmap(jax.vmap(drawn, (None, 0)))
+    return jax.jit(jax.vmap(of_task, (None, 0)))(tasks, split_keys(keys)[0])
+
+
+def _at_start(robot: Robot, task: Any) -> jaxpets.Env:
+    """Returns the environment as it starts trials of one task."""
+    if robot.task_reset is None:
+        return robot.env
+    return robot.env._replace(reset=functools.partial(robot.task_reset, task))
 
 
 def split_keys(keys: Array) -> tuple[Array, Array]:
@@ -173,7 +185,7 @@ def _actors(
 ) -> Actors:  # fmt: skip
     """Returns actors over `axes`; params holds the axes of what they read."""
     every = P(*axes)
-    start = devices.split(placement, starts, every, every)
+    start = devices.split(placement, starts, (params.reward, every), every)
     chunk = devices.split(placement, chunks, (params, every, every), every)
     return Actors(
         jax.jit(start),
@@ -183,17 +195,22 @@ def _actors(
 
 
 def _one(
-    env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int, bind: Bind
-) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Returns `start` and `chunk` of one actor."""
+    env_of: Callable[[Any], jaxpets.Env], planner: jaxpets.Planner, horizon: int,
+    length: int, bind: Bind,
+) -> tuple[Callable[..., Any], Callable[..., Any]]:  # fmt: skip
+    """Returns `start` and `chunk` of one actor; the reward's data say where it acts."""
+
+    def start(data: Any, key: Array) -> jaxpets.typing.UnrollState:
+        return jaxpets.start_trial(env_of(data), planner, key)
 
     def chunk(
         params: jaxpets.PlanParams, key: Array, state: jaxpets.typing.UnrollState
     ) -> tuple[jaxpets.typing.UnrollState, jaxpets.Transition, Array]:
+        env = env_of(params.reward)
         params = params._replace(reward=bind(params.reward, state.env.constants))
         state, transitions, plans = jaxpets.unroll(
             env, planner, params, key, state, length=length
         )
         return state, transitions, plans.value / horizon
 
-    return functools.partial(jaxpets.start_trial, env, planner), chunk
+    return start, chunk

@@ -168,7 +168,7 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
     model = _model(config, source, run, step, parts)
     placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
     actors = acting.evaluators(
-        robot.env, parts.actor, config.task_planner.horizon, config.chunk_length,
+        robot, parts.actor, config.task_planner.horizon, config.chunk_length,
         placement, shared_model=True,
     )  # fmt: skip
     keys = trial_keys(config, ZERO_SHOT, step)
@@ -216,7 +216,7 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         scorer=acting.scorer(robot),
         placement=placement,
         actors=acting.evaluators(
-            robot.env, parts.actor, config.task_planner.horizon, config.chunk_length,
+            robot, parts.actor, config.task_planner.horizon, config.chunk_length,
             placement, shared_model=False,
         ),
         learn=loop.over_branches(placement, parts.finetuner, SEED, TASK),
@@ -242,9 +242,8 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         rows = slice(int(dataset.size) - config.task_length, int(dataset.size))
         seen = jax.tree.map(lambda x: x[:, :, None, rows], dataset.data)
         keys, _ = acting.split_keys(phase.keys(last))
-        shown = Trials(
-            seen, jnp.zeros(()), acting.constants(robot.env, keys[..., None])
-        )
+        constants = acting.constants(robot, tasks.params, keys[..., None])
+        shown = Trials(seen, jnp.zeros(()), constants)
         paths = records.trajectories(phase.scorer, shown, config.seeds, tasks.names)
         run.save_trajectories(paths)
 

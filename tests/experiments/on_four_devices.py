@@ -50,7 +50,7 @@ def acting_program(flags):
     init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
     state = devices.place(spread, jax.jit(init)(keys), devices.SEED)
     params = jaxpets.PlanParams(state.params, state.reward)
-    begin = actors.start(keys)
+    begin = actors.start(params.reward, keys)
     spread_over = len(begin.env.obs.sharding.device_set)
     return spread_over, communication(actors.chunk, params, keys, begin)
 
