@@ -159,8 +159,8 @@ def _check_said(entry: str, said: str, found: str, where: Path) -> None:
     """Refuses to run a file of which only the config of a run speaks."""
     if user_files.is_file(found) and said != found:
         raise UsageError(
-            f"{flag(entry)} {said} is not valid; {where} has {found}, which is a file "
-            f"and runs only if you name it: {flag(entry)} {found}."
+            f"{where} has {found}, a file, which runs only if you name it: "
+            f"{flag(entry)} {found}."
         )
 
 

@@ -120,28 +120,34 @@ def _spread(axes: Any, place: int, scores: np.ndarray, paint: str) -> None:
 def exploration(target: Path, value: Curves, turns: Curves) -> None:
     """Draws what each arm's plans were worth to it and how often the robot turned.
 
-    Arms value different things, so each has its own axis; turns are shared.
+    Arms value different things, so each has its own axis; turns are shared. What no arm
+    has gets no row.
     """
     arms = list(dict.fromkeys([*turns, *value]))
+    named = {
+        "exploration value\nper imagined step": value,
+        "net turns\nin a trial": turns,
+    }
+    named = {label: curves for label, curves in named.items() if curves}
     with mpl.rc_context(style.STYLE):
-        figure = style.new_figure(max(2.6 * len(arms), 5.0), 4.6)
-        grid = figure.subplots(2, len(arms), squeeze=False, sharex=True)
-        for column, arm in enumerate(arms):
-            above, below = grid[:, column]
-            above.set_title(arm)
-            for axes, curves in ((above, value), (below, turns)):
+        figure = style.new_figure(max(2.6 * len(arms), 5.0), 2.3 * len(named))
+        grid = figure.subplots(len(named), len(arms), squeeze=False, sharex=True)
+        for row, (label, curves) in zip(grid, named.items(), strict=True):
+            row[0].set_ylabel(label)
+            for axes, arm in zip(row, arms, strict=True):
                 if arm in curves:
                     _draw(axes, {arm: curves[arm]}, arms, running_max=False)
                 else:
                     axes.set_yticks([])
                     axes.text(0.5, 0.5, "none", color=style.GREY,
                               transform=axes.transAxes, ha="center")  # fmt: skip
-            _log_if_wide(above, value.get(arm))
+                if curves is value:
+                    _log_if_wide(axes, value.get(arm))
+                elif axes is not row[0]:
+                    axes.sharey(row[0])
+        for above, below, arm in zip(grid[0], grid[-1], arms, strict=True):
+            above.set_title(arm)
             below.set_xlabel("trial")
-            if column:
-                below.sharey(grid[1, 0])
-        grid[0, 0].set_ylabel("exploration value\nper imagined step")
-        grid[1, 0].set_ylabel("net turns\nin a trial")
         style.save(figure, target)
 
 

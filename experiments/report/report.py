@@ -47,7 +47,7 @@ class _Files(NamedTuple):
     table_1: Path
     zero_shot: Path  # only if a run has performed every task
     figure_4: Path
-    exploration: Path
+    exploration: Path  # only if a run has explored by plans, or turns are counted
     coverage: Path  # only if a run has its coverage
 
 
@@ -87,7 +87,7 @@ def write_report(out: Path, target: Path) -> list[Path]:
         )
         covered = seen.get(preset)
         own = [row for row in rows if row.preset == preset]
-        for optional in (files.zero_shot, files.coverage):
+        for optional in (files.zero_shot, files.exploration, files.coverage):
             optional.unlink(missing_ok=True)  # of a report on other logs
         _write(own, covered, out, files)
         written += [file for file in files if file.exists()]
@@ -116,12 +116,7 @@ def _write(rows: Sequence[Row], covered: Seen | None, out: Path, files: _Files) 
         "",
         _FIGURE_4,
         "",
-        "## Exploration",
-        "",
-        f"![value and turns]({files.exploration.name})",
-        "",
-        "The arms value different things; compare their turns, not their values.",
-        "",
+        *_exploration(files.exploration),
         *coverage_section.covered(covered, files.coverage),
         *coverage_section.model_error(out / "model_error.json", rows[0].preset),
         *_ablation(out / "ablation.jsonl"),
@@ -138,7 +133,17 @@ def _draw(rows: Sequence[Row], found: Scores, explored: int, files: _Files) -> N
     planned = [r for r in rows if not at_random & {r.arm, r.data.get("planner")}]
     value = _curves(exploring(planned, "value"))
     turns = _curves(exploring(rows, "turns"))
-    figures.exploration(files.exploration, value, turns)
+    if value or turns:
+        figures.exploration(files.exploration, value, turns)
+
+
+def _exploration(picture: Path) -> list[str]:
+    """Returns the section on what exploration was like, if there is a picture of it."""
+    if not picture.exists():
+        return []
+    text = "The arms value different things; compare their turns, not their values."
+    lines = ["## Exploration", "", f"![value and turns]({picture.name})"]
+    return [*lines, "", text, ""]
 
 
 def _explored(rows: Sequence[Row]) -> int:

@@ -107,8 +107,8 @@ def _without_files(config: Config, env: str | None) -> Config:
     """
     if user_files.is_file(config.env) and config.env != env:
         raise UsageError(
-            f"--env {env} is not valid; the runs are of {config.env}, which is a file "
-            f"and runs only if you name it: --env {config.env}."
+            f"the runs are of {config.env}, a file, which runs only if you name it: "
+            f"--env {config.env}."
         )
     return dataclasses.replace(config, arm="random", tasks=None)
 

@@ -8,6 +8,7 @@ must depend on neither. So `render` starts this module as a child.
 """
 
 import argparse
+import logging
 import math
 import os
 import subprocess
@@ -125,6 +126,8 @@ def write_mp4(target: Path, pictures: Iterator[np.ndarray], look: Look) -> None:
     """Writes pictures as H.264."""
     import imageio_ffmpeg
 
+    # Of a video without a picture, whose reason is said elsewhere.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     size = (look.width, look.height)
     # yuv420p wants even sizes, no more.
     writer = imageio_ffmpeg.write_frames(

@@ -14,6 +14,7 @@ from experiments.errors import UsageError
 from experiments.report import style
 from experiments.run import main
 from experiments.storage import rundir
+from experiments.tools import model_error, pretrained, video
 from jaxpets import envs
 
 FILE = own_robot.__file__
@@ -73,6 +74,14 @@ def test_a_trial_is_scored_by_what_was_drawn_for_it(out):
         assert [row["constants/goal"] for row in logged] == goal.tolist()
 
 
+def test_a_reward_of_one_action_is_never_given_those_of_a_trial(out):
+    """It adds up all entries of what it takes for one action."""
+    paths = dict(np.load(out / NAME / "zero-shot-002" / "trajectories.npz"))
+    rate, force = paths["obs"][0, 1, ..., 3], paths["action"][0, 1, ..., 0]
+    want = (rate - 0.1 * force**2).sum(-1)
+    np.testing.assert_allclose(paths["returns"][0, 1], want, rtol=1e-4, atol=1e-3)
+
+
 def test_tasks_of_a_file_stand_beside_those_of_the_robot(out):
     (row,) = runs.rows(out / NAME / TUNED)
     assert (row["task"], set(row["returns"])) == ("near", {"near"})
@@ -99,6 +108,19 @@ def test_a_file_runs_only_if_the_command_names_it(out, capsys, wanted):
     flags = [x for pair in (ROBOT, ARM) for x in pair if said >= {*pair}]
     assert main(["zero-shot", "--from", str(out / NAME), *flags]) == 2
     assert f"runs only if you name it: {' '.join(wanted)}." in capsys.readouterr().err
+
+
+def test_a_tool_runs_no_file_that_only_a_run_names(out, tmp_path, capsys):
+    flags = (str(out / NAME), "--out", str(tmp_path / "error.json"))
+    assert model_error.main(flags) == 2
+    assert f"only if you name it: --env {FILE}." in capsys.readouterr().err
+    assert pretrained.main([str(out / NAME), "mine"]) == 2
+    assert f"needs {FILE}, which does not come with" in capsys.readouterr().err
+
+
+def test_a_robot_without_a_model_is_not_drawn():
+    with pytest.raises(UsageError, match=f"{FILE} has no model that can be drawn"):
+        video._opened(FILE, np.zeros((1, 4), np.float32), video.Look())
 
 
 WRONG = {

@@ -246,6 +246,22 @@ def test_paper_numbers_stand_beside_the_preset_paper(tmp_path):
     assert other["epistemic"]["forward"]["mean"] == 2.0
 
 
+def test_robots_of_one_preset_are_kept_apart(tmp_path):
+    """The tasks of each are those of its logs, and the paper is about one of them."""
+    write_arm(tmp_path, "epistemic", [1.0], preset="paper")
+    other = {"preset": "paper", "arm": "epistemic", "env": "dmc/walker"}
+    rows = [
+        {**row, "task": f"walk-{row['task']}"}
+        for row in zero_shot_rows("epistemic", [7.0])
+        if row["task"] == "forward"
+    ]
+    write_run(tmp_path / "walker" / "zero-shot-003", rows, phase="zero-shot", **other)
+    _, table = report_of(tmp_path)
+    assert list(table["epistemic"]) == list(TASK_NAMES)
+    text = (tmp_path / "report" / "report-paper-dmc-walker.md").read_text()
+    assert "| walk-forward | 7.0 (1 seed) |\n" in text and "paper: SU" not in text
+
+
 def test_data_efficiency_is_a_table_of_its_own(out):
     rows = zero_shot_rows("epistemic", [50.0, 60.0, 70.0], explored=1)
     folder = out / "laptop-epistemic" / "zero-shot-001"
