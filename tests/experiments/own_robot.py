@@ -36,6 +36,15 @@ def robot(backend):
     def step(state, action):
         return env.step(state, action)._replace(constants=state.constants)
 
+    turned = mujoco_env.mujoco_env(
+        XML, observe=("qpos", "qvel"), backend=backend,
+        reset=lambda key: (jnp.array([0.0, 1.0]), jnp.zeros(2)),
+    )  # fmt: skip
+
+    def task_reset(task, key):
+        spins = turned.reset(key)._replace(constants=reset(key).constants)
+        return jax.tree.map(lambda a, b: jnp.where(task == 1, a, b), spins, reset(key))
+
     def reach(constants, obs, action, next_obs):
         return -jnp.abs(next_obs[..., x] - constants["goal"])
 
@@ -52,6 +61,7 @@ def robot(backend):
             Axis("rate", "rad/s", rate, (-10.0, 0.0, 10.0)),
         ),
         angle=turn,
+        task_reset=task_reset,
     )
 
 

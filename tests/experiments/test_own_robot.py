@@ -82,6 +82,13 @@ def test_a_reward_of_one_action_is_never_given_those_of_a_trial(out):
     np.testing.assert_allclose(paths["returns"][0, 1], want, rtol=1e-4, atol=1e-3)
 
 
+def test_trials_of_a_task_start_where_the_robot_says(out):
+    paths = np.load(out / NAME / "zero-shot-002" / "trajectories.npz")
+    first = paths["obs"][0, :, :, 0, 1]  # the angle after a step
+    assert paths["tasks"].tolist() == ["reach", "spin"]
+    assert (np.abs(first[0]) < 0.3).all() and (np.abs(first[1] - 1.0) < 0.3).all()
+
+
 def test_tasks_of_a_file_stand_beside_those_of_the_robot(out):
     (row,) = runs.rows(out / NAME / TUNED)
     assert (row["task"], set(row["returns"])) == ("near", {"near"})
