@@ -38,8 +38,8 @@ os.environ["XDG_CACHE_HOME"] = os.environ["JAX_COMPILATION_CACHE_DIR"]
 # What is traced for coverage takes a third longer. These files are not: each line that
 # they reach others reach as well.
 UNTRACED = {
-    "library": ("transforms", "chunks", "over_seeds", "sweeps", "properties"),
-    "kernel": ("cpu_rollout", "fused_transforms"),
+    "library": ("transforms", "sweeps", "properties"),
+    "kernel": ("fused_transforms",),
     "experiments": ("devices", "hosts", "refit"),
     "benchmarks": ("accuracy", "benchmarks", "figure"),
     "examples": ("examples",),

@@ -97,6 +97,7 @@ def build(name: str, model: Any, recipe: Recipe, backend: str = "mujoco") -> Rob
         qpos_fn=qpos_fn(model, rows, recipe.control_step * recipe.action_repeat),
         camera=recipe.camera,
         task_reset=_task_reset(env, tuple(found), elsewhere) if elsewhere else None,
+        action_repeat=recipe.action_repeat,
     )
 
 

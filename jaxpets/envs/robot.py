@@ -70,6 +70,8 @@ class Robot(NamedTuple):
       camera: of the model, to draw it by; None is MuJoCo's own.
       task_reset: `(a row of tasks.params, key) -> EnvState`, where trials of a task
         start; None if all of them start as `env.reset` does.
+      action_repeat: control steps of the original in a step of `env`: what is known by
+        its return over 1,000 control steps is tried for 1,000 over this.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Robot(NamedTuple):
     qpos_fn: Callable[[Array], Array] | None = None
     camera: str | None = None
     task_reset: Callable[[Any, Array], EnvState] | None = None
+    action_repeat: int = 1
 
 
 def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:

@@ -104,7 +104,7 @@ def test_a_robot_has_what_a_report_shows():
     assert [axis.unit for axis in robot.axes] == ["m/s", "rad/s"]
     rows = robot.env.coordinates
     assert rows[robot.angle].name == "qpos/rooty" and rows[robot.angle].kind == "angle"
-    assert robot.space.coordinates == rows
+    assert robot.space.coordinates == rows and robot.action_repeat == 2
     assert robot.camera in [robot.model.camera(i).name for i in range(robot.model.ncam)]
     edges = robot.axes[0].edges
     assert sorted(edges) == list(edges) and edges[0] == -8.0
