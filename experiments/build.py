@@ -21,7 +21,7 @@ from experiments.config import (
 )
 from jaxpets.envs import half_cheetah
 
-State = jaxpets.LearnerState
+State = jaxpets.typing.LearnerState
 KERNEL, SCAN = "kernel", "scan"
 Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
@@ -46,7 +46,7 @@ class Parts(NamedTuple):
     reward_data: jaxpets.RewardData  # of its reward
     explored_by: str  # what imagines in phase 1, as env.json has it
     performed_by: str  # and in phase 2
-    refitter: jaxpets.Fitter | None  # between the phases
+    refitter: jaxpets.typing.Fitter | None  # between the phases
     finetuner: jaxpets.Learner  # phase 2
 
 
@@ -125,7 +125,9 @@ def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
     )
 
 
-def _fitter(ensemble: jaxpets.Ensemble, training: TrainingConfig) -> jaxpets.Fitter:
+def _fitter(
+    ensemble: jaxpets.Ensemble, training: TrainingConfig
+) -> jaxpets.typing.Fitter:
     adam = optax.adam(training.learning_rate)
     return jaxpets.fitter(ensemble, adam, part(training, jaxpets.FitConfig))
 

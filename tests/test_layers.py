@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import jaxpets
-from jaxpets import coordinates
+from jaxpets import coordinates, models
 
 PACKAGE = Path(jaxpets.__file__).parent
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -20,6 +20,7 @@ LAYERS = {
     "_src": 0,
     "_src.types": 0,
     "_src.checks": 0,
+    "_src.tensor_file": 0,
     "_src.moments": 1,
     "_src.elites": 1,
     "_src.returns": 1,
@@ -56,6 +57,8 @@ LAYERS = {
     "_src.ensemble": 4,
     "_src.fitter": 5,
     "_src.fused_rollout": 5,
+    "_src.model_file": 5,
+    "_src.pretrained": 6,
     "_src.learner": 6,
     "_src.over_seeds": 7,
     "envs.extra": 0,
@@ -71,6 +74,7 @@ LAYERS = {
     "envs": 5,
     "coordinates": 8,
     "datasets": 8,
+    "models": 8,
     "optimizers": 8,
     "rewards": 8,
     "typing": 8,
@@ -81,6 +85,7 @@ MODULES_OF_NAMES = [
     jaxpets,
     coordinates,
     jaxpets.datasets,
+    models,
     jaxpets.optimizers,
     jaxpets.rewards,
     jaxpets.typing,
@@ -101,6 +106,7 @@ HOMES = {
     "brax": set(),
     "gymnasium": set(),
     "orbax": set(),
+    "safetensors": {"_src.tensor_file"},
     "tyro": set(),
 }
 
