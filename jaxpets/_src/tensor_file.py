@@ -46,9 +46,16 @@ def write(
       path: of the file; its folder must be there.
       arrays: float32, int32, uint32 or bool.
       metadata: texts by name.
+
+    Raises:
+      ValueError: for an array of another dtype.
     """
     target = Path(path)
     rows = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    for name, row in rows.items():
+        if str(row.dtype) not in _DTYPES.values():
+            wanted = ", ".join(_DTYPES.values())
+            raise ValueError(f"{name} must be of {wanted}, got {row.dtype}.")
     content = save(rows, dict(metadata))
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".writing-") as folder:
         draft = Path(folder) / target.name
