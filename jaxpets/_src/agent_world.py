@@ -53,7 +53,8 @@ def numbers(world: World, name: str, value: Any) -> np.ndarray:
     """
     shape = (*world.lead, world.obs_size)
     try:
-        array = np.array(value, np.float32)
+        with np.errstate(over="ignore"):  # what is too large is refused below
+            array = np.array(value, np.float32)
     except (TypeError, ValueError) as error:
         kind = type(value).__name__
         raise TypeError(
