@@ -55,4 +55,4 @@ actor = jaxpets.plan(rollout, task, search)
 for name, wanted in {"stand": (1.0, 0.0), "spin": (0.0, 1.0)}.items():
     agent.perform(np.array(wanted), actor)
     height, _, speed = trial(1000)[trial_length // 2 :].mean(axis=0)
-    print(f"{name:5}: height {height:5.2f} m, {speed:5.2f} rad/s")
+    print(f"{name:5} height {height:5.2f} m, {speed:5.2f} rad/s")
