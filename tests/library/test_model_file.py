@@ -13,6 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 import jaxpets
 from jaxpets import coordinates, models
+from jaxpets._src import tensor_file
 from jaxpets.coordinates import Coordinate
 
 ABOUT = {"environment": "my/cart", "licence": "MIT", "training": {"trials": 3}}
@@ -177,6 +178,12 @@ def test_what_is_no_safetensors_is_refused(saved, tmp_path):
             jaxpets.load_model(path)
     with pytest.raises(FileNotFoundError, match="path must be a file"):
         jaxpets.load_model(tmp_path / "none")
+
+
+def test_only_what_can_be_read_is_written(tmp_path):
+    with pytest.raises(ValueError, match=r"x must be of float32, .* got int64"):
+        tensor_file.write(tmp_path / "m", {"x": np.arange(3)}, {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_comes_with_the_library_is_read():
