@@ -176,7 +176,9 @@ def planner(
     )
 
 
-def fitter(size: Size, num_epochs: int = 5, batch_size: int = 32) -> jaxpets.Fitter:
+def fitter(
+    size: Size, num_epochs: int = 5, batch_size: int = 32
+) -> jaxpets.typing.Fitter:
     """Returns the trainer of PETS, in TF32 where the hardware has it."""
     config = jaxpets.FitConfig(num_epochs=num_epochs, batch_size=batch_size)
     return jaxpets.fitter(model(size, "tf32"), optax.adam(1e-3), config)
@@ -212,7 +214,7 @@ def params(size: Size, key: Array) -> jaxpets.EnsembleParams:
 
 
 def prepare_fit(
-    size: Size, fitter: jaxpets.Fitter, keys: Array, num_rows: int, capacity: int
+    size: Size, fitter: jaxpets.typing.Fitter, keys: Array, num_rows: int, capacity: int
 ) -> tuple[jaxpets.EnsembleParams, jaxpets.typing.FitState, jaxpets.datasets.Dataset]:
     """Returns what a fitter reads, one of each per key."""
 
@@ -225,7 +227,7 @@ def prepare_fit(
     return jax.jit(jax.vmap(prepare, out_axes=axes))(keys)
 
 
-def fit_seeds(fitter: jaxpets.Fitter) -> Callable[..., Any]:
+def fit_seeds(fitter: jaxpets.typing.Fitter) -> Callable[..., Any]:
     """Returns `fitter.step` mapped over seeds with equally many rows."""
     many = jax.vmap(fitter.step, (0, 0, 0, jaxpets.datasets.AXES))
 

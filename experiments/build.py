@@ -23,7 +23,7 @@ from experiments.config import (
 )
 from jaxpets.envs import Robot
 
-State = jaxpets.LearnerState
+State = jaxpets.typing.LearnerState
 KERNEL, SCAN = "kernel", "scan"
 Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
@@ -44,7 +44,7 @@ class Parts(NamedTuple):
     bind: Bind  # what gives them the constants of a trial
     explored_by: str  # what imagines in phase 1, as env.json has it
     performed_by: str  # and in phase 2
-    refitter: jaxpets.Fitter | None  # between the phases
+    refitter: jaxpets.typing.Fitter | None  # between the phases
     finetuner: jaxpets.Learner  # phase 2
 
 
@@ -165,7 +165,9 @@ def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
     )
 
 
-def _fitter(ensemble: jaxpets.Ensemble, training: TrainingConfig) -> jaxpets.Fitter:
+def _fitter(
+    ensemble: jaxpets.Ensemble, training: TrainingConfig
+) -> jaxpets.typing.Fitter:
     adam = optax.adam(training.learning_rate)
     return jaxpets.fitter(ensemble, adam, part(training, jaxpets.FitConfig))
 

@@ -29,7 +29,7 @@ def rows(
     scorer: Scorer,
     labels: Sequence[dict[str, Any]],
     trials: Trials,
-    fit: jaxpets.FitMetrics | None = None,
+    fit: jaxpets.typing.FitMetrics | None = None,
     params: jaxpets.EnsembleParams | None = None,
 ) -> list[dict[str, Any]]:
     """Returns one row per trial, its labels first.
@@ -63,7 +63,7 @@ def rows(
 
 
 def _fit(
-    fit: jaxpets.FitMetrics, params: jaxpets.EnsembleParams, i: int
+    fit: jaxpets.typing.FitMetrics, params: jaxpets.EnsembleParams, i: int
 ) -> dict[str, float]:
     row = {name: np.asarray(x).flat[i].item() for name, x in fit._asdict().items()}
     for name in ("max_logvar", "min_logvar"):

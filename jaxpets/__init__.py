@@ -25,17 +25,20 @@ candidate at one step, `[E, P, D]`, and returns `[E, P]` or `[]`.
 """
 
 from jaxpets import datasets, optimizers, rewards, typing
+from jaxpets._src.agent import agent
 from jaxpets._src.check_space import check_space
 from jaxpets._src.ensemble import Ensemble, delta_space, ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig
 from jaxpets._src.ensemble_params import EnsembleParams
-from jaxpets._src.fitter import FitConfig, FitMetrics, Fitter, fitter
+from jaxpets._src.fitter import FitConfig, fitter
 from jaxpets._src.fused_rollout import fused_rollout
-from jaxpets._src.learner import Learner, LearnerState, RewardData, learner
+from jaxpets._src.learner import Learner, RewardData, learner
+from jaxpets._src.model_file import load_model, save_model
 from jaxpets._src.network import Precision
 from jaxpets._src.over_seeds import SEED_AXES, over_seeds
 from jaxpets._src.per_state import per_state
 from jaxpets._src.plan import plan
+from jaxpets._src.pretrained import pretrained
 from jaxpets._src.random_planner import random_planner
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import (
@@ -43,7 +46,6 @@ from jaxpets._src.types import (
     EnvState,
     ModelSpace,
     Planner,
-    PlanOutput,
     PlanParams,
     Transition,
 )
@@ -59,17 +61,14 @@ __all__ = [
     "Env",
     "EnvState",
     "FitConfig",
-    "FitMetrics",
-    "Fitter",
     "Learner",
-    "LearnerState",
     "ModelSpace",
-    "PlanOutput",
     "PlanParams",
     "Planner",
     "Precision",
     "RewardData",
     "Transition",
+    "agent",
     "check_space",
     "datasets",
     "delta_space",
@@ -77,13 +76,16 @@ __all__ = [
     "fitter",
     "fused_rollout",
     "learner",
+    "load_model",
     "optimizers",
     "over_seeds",
     "particle_rollout",
     "per_state",
     "plan",
+    "pretrained",
     "random_planner",
     "rewards",
+    "save_model",
     "start_trial",
     "typing",
     "unroll",

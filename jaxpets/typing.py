@@ -1,5 +1,6 @@
 """Everything that one annotates with: the contracts of functions, and the records."""
 
+from jaxpets._src.agent import Agent
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams, NetworkParams, Scaler
 from jaxpets._src.fitter import FitMetrics, FitState, Fitter
@@ -27,6 +28,7 @@ from jaxpets._src.types import (
 from jaxpets._src.unroll import UnrollState
 
 __all__ = [
+    "Agent",
     "Candidates",
     "Coordinate",
     "Dataset",

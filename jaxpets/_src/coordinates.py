@@ -130,6 +130,8 @@ def _check(rows: tuple[Coordinate, ...]) -> None:
     seen: set[str] = set()
     for i, row in enumerate(rows):
         check_record(f"coordinates[{i}]", row, Coordinate)
+        if not isinstance(row.name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError(f"names of coordinates must be texts, got {row.name!r}.")
         where = f"of entry {row.name!r}"
         check_flag(f"is_input {where}", row.is_input)
         check_flag(f"is_bounded {where}", row.is_bounded)

@@ -40,12 +40,16 @@ def init(capacity: int, obs_size: int, action_size: int) -> Dataset:
     return Dataset(Transition(obs, action, next_obs), size, cursor)
 
 
-def append(dataset: Dataset, transitions: Transition) -> Dataset:
+def append(
+    dataset: Dataset, transitions: Transition, count: Array | None = None
+) -> Dataset:
     """Returns the dataset with T more rows, the oldest replaced once it is full.
 
     Args:
       dataset: what there is.
       transitions: `[T, D]`, `[T, A]`, `[T, D]`, T at most the capacity.
+      count: `[]` int32, how many of the rows are meant, the first ones; None for all.
+        So that trials of any length are appended by one program.
 
     Raises:
       TypeError, ValueError: if a record, a width, a length or a dtype does not fit.
@@ -64,14 +68,19 @@ def append(dataset: Dataset, transitions: Transition) -> Dataset:
     action_size = dataset.data.action.shape[1]
     check_array("transitions.action", transitions.action, [length, action_size])
     rows = (dataset.cursor + jnp.arange(length, dtype=jnp.int32)) % capacity
+    added: int | Array = length
+    if count is not None:
+        # Beyond the last row nothing is written.
+        rows = jnp.where(jnp.arange(length) < count, rows, capacity)
+        added = count
     data = Transition(
         *(
             old.at[rows].set(new)
             for old, new in zip(dataset.data, transitions, strict=True)
         )
     )
-    size = jnp.minimum(dataset.size + length, capacity)
-    return Dataset(data, size, (dataset.cursor + length) % capacity)
+    size = jnp.minimum(dataset.size + added, capacity)
+    return Dataset(data, size, (dataset.cursor + added) % capacity)
 
 
 def grow(dataset: Dataset, capacity: int) -> Dataset:

@@ -1,6 +1,7 @@
 """Environments; these modules need the extra `jaxpets[envs]`."""
 
 from jaxpets.envs.adapters import env_rollout, from_brax
+from jaxpets.envs.mujoco_env import mujoco_env
 from jaxpets.envs.named import make, names
 from jaxpets.envs.robot import Axis, Robot, Tasks, tasks_of, with_constants
 
@@ -11,6 +12,7 @@ __all__ = [
     "env_rollout",
     "from_brax",
     "make",
+    "mujoco_env",
     "names",
     "tasks_of",
     "with_constants",

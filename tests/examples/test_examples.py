@@ -89,3 +89,27 @@ def test_the_bonus_is_the_divergence_of_the_members(bonus, monkeypatch):
     np.testing.assert_allclose(found, np.full((3, 2), wanted), rtol=1e-5)
     agreed = objective((jnp.zeros_like(mean), jnp.ones_like(mean)), obs, action, obs)
     np.testing.assert_allclose(agreed, 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_robot_of_ones_own_is_explored_and_told_to_do_two_things():
+    names, lines = run("own_robot.py", "--tiny")
+    assert len(lines) == 2 + 2
+    assert all(np.isfinite(numbers(line)).all() for line in lines)
+    assert [line.split()[0] for line in lines[2:]] == ["forward", "high"]
+    assert names["state"].dataset.size == 2 * 10
+    # It fell by no more than it is high, and no faster than it may.
+    assert names["rows"][names["height"]].name == "qpos/z"
+    assert -1.0 < numbers(lines[-1])[0] < 1.0
+
+
+@pytest.mark.slow
+def test_a_gymnasium_robot_goes_from_exploration_to_two_tasks():
+    names, lines = run("gymnasium_robot.py", "--tiny")
+    assert [line.split()[0] for line in lines] == ["trial", "trial", "stand", "spin"]
+    agent = names["agent"]
+    assert agent.num_steps == 4 * 12  # it goes on observing while it performs
+    heights = [numbers(line)[0] for line in lines[2:]]
+    assert all(-1.0 <= height <= 1.0 for height in heights)
+    # Two tasks, one program.
+    assert agent._acts[names["actor"]]._cache_size() == 1

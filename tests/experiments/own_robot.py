@@ -25,7 +25,7 @@ XML = """
 
 
 def robot(backend):
-    env = mujoco_env.mujoco_env(XML, observe=("qpos", "qvel"), backend=backend)
+    env = mujoco_env(XML, observe=("qpos", "qvel"), backend=backend)
     place = {row.name: i for i, row in enumerate(env.coordinates)}
     x, turn, rate = (place[f"{name}"] for name in ("qpos/x", "qpos/turn", "qvel/turn"))
 
@@ -36,7 +36,7 @@ def robot(backend):
     def step(state, action):
         return env.step(state, action)._replace(constants=state.constants)
 
-    turned = mujoco_env.mujoco_env(
+    turned = mujoco_env(
         XML, observe=("qpos", "qvel"), backend=backend,
         reset=lambda key: (jnp.array([0.0, 1.0]), jnp.zeros(2)),
     )  # fmt: skip

@@ -16,6 +16,7 @@ PAGES = (
     "experiments/README.md",
     "benchmarks/README.md",
     "benchmarks/kernel.md",
+    "docs/own_robot.md",
 )
 # The columns of the main table after the paper's.
 COLUMNS = (

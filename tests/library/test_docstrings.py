@@ -6,12 +6,13 @@ import re
 import pytest
 
 import jaxpets
-from jaxpets import coordinates
+from jaxpets import coordinates, models
 
 MODULES = [
     jaxpets,
     coordinates,
     jaxpets.datasets,
+    models,
     jaxpets.optimizers,
     jaxpets.rewards,
     jaxpets.typing,

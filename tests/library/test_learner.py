@@ -119,7 +119,7 @@ def test_one_trace_and_stable_avals_while_data_grow(key):
 
 def test_vmapped_seeds_equal_single_runs():
     """As the experiments map it: the seeds share the size of their datasets."""
-    axes = jaxpets.LearnerState(0, 0, jaxpets.datasets.AXES, 0)
+    axes = jaxpets.typing.LearnerState(0, 0, jaxpets.datasets.AXES, 0)
     keys = jax.random.split(jax.random.key(3), 2)
     states = jax.jit(jax.vmap(LEARNER.init, out_axes=axes))(keys)
     step = jax.vmap(

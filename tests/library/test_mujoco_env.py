@@ -11,8 +11,7 @@ import jaxpets
 from jaxpets import coordinates
 from jaxpets.coordinates import Coordinate
 from jaxpets.envs import half_cheetah as hc
-from jaxpets.envs import mujoco_env as module
-from jaxpets.envs.mujoco_env import mujoco_env
+from jaxpets.envs.mujoco_env import load_model, mujoco_env
 from jaxpets.envs.observations import DEFAULT
 
 EVERYTHING = (
@@ -194,7 +193,7 @@ def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     want = mujoco_env(CART).reset(key)
     for given in (path, str(path), model):
         jax.tree.map(np.testing.assert_array_equal, mujoco_env(given).reset(key), want)
-    assert module.load_model(model) is model
+    assert load_model(model) is model
 
 
 NO_RANGE = CART.replace(' ctrlrange="-1 1"', "")

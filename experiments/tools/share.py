@@ -1,0 +1,128 @@
+"""`python -m experiments.tools.share RUN FILE`: a run's model as one file.
+
+What `jaxpets.load_model` reads, with the numbers that the run performs with. The files
+of `jaxpets.pretrained` were written by this, from `results/pretrained`.
+"""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import jaxpets
+from experiments import exploration
+from experiments.build import build
+from experiments.config import Config, PlannerConfig
+from experiments.errors import RunError, UsageError
+from experiments.storage import rundir
+from experiments.storage.folder import RunFolder
+
+_ALL = ("horizon", "num_samples", "num_iterations")
+_SETTINGS = {
+    "cem": (*_ALL, "num_elites", "momentum", "legacy_variance"),
+    "icem": (*_ALL, "num_elites", "momentum", "noise_beta"),
+    "mppi": (*_ALL, "temperature"),
+}
+
+
+def share(
+    run: Path, path: Path, *, seed: int | None, environment: str, licence: str
+) -> None:
+    """Writes the model of an exploration run to one file.
+
+    Args:
+      run: folder of the run.
+      path: of the file.
+      seed: which of the run's; None for the first.
+      environment: its name, as `jaxpets.envs.make` takes it.
+      licence: of the file.
+
+    Raises:
+      RunError: if the run has no checkpoint or not that seed.
+    """
+    folder = RunFolder(run)
+    config = exploration.config_of(folder)
+    seed = config.seeds[0] if seed is None else seed
+    if seed not in config.seeds:
+        valid = ", ".join(map(str, config.seeds))
+        raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
+    parts = build(config)
+    template = exploration.model_of(exploration.template(config, parts))
+    found = folder.restore(template, part=True)
+    if found is None:
+        raise UsageError(f"{run} has no checkpoint.")
+    trial, state = found
+    i = config.seeds.index(seed)
+    params = jax.tree.map(lambda x: x[i], state.params)
+    about = {
+        "environment": environment,
+        "licence": licence,
+        "training": _training(folder, config, seed, trial),
+        "search": _search(config.task_planner),
+    }
+    jaxpets.save_model(path, _as_performed(parts.model, config), params, about=about)
+
+
+def _as_performed(model: jaxpets.Ensemble, config: Config) -> jaxpets.Ensemble:
+    """Returns the ensemble in the precision in which tasks are planned."""
+    assert model.config is not None and model.space is not None
+    precision = jaxpets.Precision(config.task_planner.precision)
+    return jaxpets.ensemble(
+        dataclasses.replace(model.config, precision=precision),
+        model.space,
+        obs_size=model.obs_size,
+        action_size=model.action_size,
+    )
+
+
+def _training(
+    folder: RunFolder, config: Config, seed: int, trial: int
+) -> dict[str, Any]:
+    performed = folder.find_json(f"performed-{rundir.CONFIG}")
+    return {
+        "arm": config.arm,
+        "seed": seed,
+        "num_trials": trial,
+        "trial_length": config.trial_length,
+        "refit": performed.get("refit"),
+        "software": folder.find_json(rundir.ENVIRONMENT),
+    }
+
+
+def _search(planner: PlannerConfig) -> dict[str, Any]:
+    """Returns which search it is, its keyword arguments, and the particles."""
+    names = _SETTINGS[planner.optimizer]
+    return {
+        "optimizer": planner.optimizer,
+        "settings": {name: getattr(planner, name) for name in names},
+        "num_particles": planner.num_particles,
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Shares a model; returns the exit code, as `experiments.run`."""
+    parser = argparse.ArgumentParser(
+        prog="experiments.tools.share", description=__doc__
+    )
+    parser.add_argument("run", type=Path, help="folder of an exploration run")
+    parser.add_argument("file", type=Path, help="as model.safetensors")
+    parser.add_argument("--seed", type=int, help="by default the run's first")
+    parser.add_argument("--environment", default="pets/half_cheetah", help="its name")
+    parser.add_argument("--licence", default="Apache-2.0", help="of the file")
+    args = parser.parse_args(argv)
+    options = {"environment": args.environment, "licence": args.licence}
+    try:
+        share(args.run, args.file, seed=args.seed, **options)
+    except RunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    print(f"wrote {args.file}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""What an agent computes: to act, to remember, to learn; pure, a program each."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxpets._src import dataset as datasets
+from jaxpets._src.checks import check_array, check_like
+from jaxpets._src.ensemble import Ensemble
+from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.fitter import FitMetrics, Fitter
+from jaxpets._src.learner import LearnerState, RewardData
+from jaxpets._src.types import Planner, PlanParams, Transition
+
+# `(key, number, is_new, PlanParams, state, obs) -> (action, state)`.
+ActFn = Callable[[Array, Any, Any, PlanParams, Any, Any], tuple[Array, Any]]
+LearnFn = Callable[[Array, LearnerState], tuple[LearnerState, FitMetrics]]
+
+
+class AgentSteps(NamedTuple):
+    """Pure functions of one agent.
+
+    Attributes:
+      action_size: A.
+      init: `(key, EnsembleParams or None) -> LearnerState`.
+      append: `(LearnerState, transitions [T, ...], count []) -> LearnerState`: with the
+        first `count` rows more.
+      learn: `(key, LearnerState) -> (LearnerState, FitMetrics)`.
+    """
+
+    action_size: int
+    init: Callable[[Array, EnsembleParams | None], LearnerState]
+    append: Callable[[LearnerState, Transition, Any], LearnerState]
+    learn: LearnFn
+
+
+def agent_steps(
+    model: Ensemble, fitter: Fitter, reward_data: RewardData, capacity: int
+) -> AgentSteps:
+    """Builds what an agent computes apart from acting; see `agent`."""
+
+    def init(key: Array, params: EnsembleParams | None) -> LearnerState:
+        model_key, reward_key = jax.random.split(key)
+        params = model.init(model_key) if params is None else params
+        dataset = datasets.init(capacity, model.obs_size, model.action_size)
+        reward = reward_data.refresh(reward_data.init(reward_key), params, dataset)
+        return LearnerState(params, fitter.init(params), dataset, reward)
+
+    def append(state: LearnerState, rows: Transition, count: Array) -> LearnerState:
+        return state._replace(dataset=datasets.append(state.dataset, rows, count))
+
+    def learn(key: Array, state: LearnerState) -> tuple[LearnerState, FitMetrics]:
+        params, fit, metrics = fitter.step(state.params, key, state.fit, state.dataset)
+        reward = reward_data.refresh(state.reward, params, state.dataset)
+        # Another shape would retrace every plan.
+        check_like("reward_data.refresh's result", reward, state.reward)
+        return LearnerState(params, fit, state.dataset, reward), metrics
+
+    return AgentSteps(model.action_size, init, append, learn)
+
+
+def act_fn(planner: Planner, action_size: int, num_envs: int | None) -> ActFn:
+    """Returns one step of a planner in one world, or in N of them.
+
+    The arguments of what is returned: `key`; `number`, `[]`, of the step, which is
+    folded into it; `is_new`, `[]` or `[N]`, whether a trial begins; PlanParams; the
+    planner's state, `[N, ...]`; `obs`, `[D]` or `[N, D]`.
+    """
+
+    def one(
+        params: PlanParams, key: Array, is_new: Array, state: Any, obs: Array
+    ) -> tuple[Array, Any]:
+        state = jax.tree.map(
+            functools.partial(jnp.where, is_new), planner.init(), state
+        )
+        output, state = planner.step(params, key, state, obs)
+        check_array("the planner's action", output.action, [action_size])
+        return output.action, state
+
+    def act(
+        key: Array, number: Any, is_new: Any, params: PlanParams, state: Any, obs: Any
+    ) -> tuple[Array, Any]:
+        key = jax.random.fold_in(key, number)
+        if num_envs is None:
+            return one(params, key, is_new, state, obs)
+        keys = jax.random.split(key, num_envs)
+        every = jax.vmap(one, (None, 0, 0, 0, 0))
+        return every(params, keys, is_new, state, obs)
+
+    return act
+
+
+def first_state(planner: Planner, lead: tuple[int, ...]) -> Any:
+    """Returns a planner's state with the leading axes of its worlds."""
+
+    def every(leaf: Any) -> Array:
+        return jnp.broadcast_to(leaf, (*lead, *jnp.shape(leaf)))
+
+    return jax.tree.map(every, planner.init())
+
+
+def strongly_typed(tree: Any) -> Any:
+    """Returns numbers as arrays of their own type: one of Python would compile anew."""
+
+    def array(leaf: Any) -> Array:
+        dtype = leaf.dtype if isinstance(leaf, Array) else np.asarray(leaf).dtype
+        return jnp.asarray(leaf, jax.dtypes.canonicalize_dtype(dtype))
+
+    return jax.tree.map(array, tree)

@@ -1,0 +1,136 @@
+"""What an agent is told by a world that is not JAX: checked, and as arrays of NumPy."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpets._src.types import Transition
+
+AUTORESETS = ("Disabled", "NextStep", "SameStep")
+
+
+class World(NamedTuple):
+    """Shapes of one world, or of N that are stepped together.
+
+    Attributes:
+      obs_size: D.
+      num_envs: N, or None for one without a leading axis.
+      autoreset: who begins the next trial, one of AUTORESETS.
+    """
+
+    obs_size: int
+    num_envs: int | None
+    autoreset: str
+
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """`()` or `(N,)`."""
+        return () if self.num_envs is None else (self.num_envs,)
+
+
+def autoreset_of(value: Any, num_envs: int | None) -> str:
+    """Returns the mode that was asked for, by name or as an enum of Gymnasium.
+
+    Raises:
+      ValueError: if there is no such mode.
+    """
+    if value is None:
+        return "Disabled" if num_envs is None else "NextStep"
+    name = getattr(value, "value", value)
+    if name not in AUTORESETS:
+        wanted = ", ".join(AUTORESETS)
+        raise ValueError(f"autoreset must be one of {wanted}, got {value!r}.")
+    return name
+
+
+def numbers(world: World, name: str, value: Any) -> np.ndarray:
+    """Returns a copy of observations as float32, `[D]` or `[N, D]`.
+
+    Raises:
+      TypeError, ValueError: if they are not of this shape, or not finite.
+    """
+    shape = (*world.lead, world.obs_size)
+    try:
+        with np.errstate(over="ignore"):  # what is too large is refused below
+            array = np.array(value, np.float32)
+    except (TypeError, ValueError) as error:
+        kind = type(value).__name__
+        raise TypeError(
+            f"{name} must be numbers of shape {shape}, got {kind}."
+        ) from error
+    if array.shape != shape:
+        raise ValueError(f"{name} must be of shape {shape}, got {array.shape}.")
+    if not np.isfinite(array).all():
+        entry = np.argwhere(~np.isfinite(array))[0].tolist()
+        got = array[tuple(entry)]
+        raise ValueError(f"{name} must be finite, got {got} in entry {entry}.")
+    return array
+
+
+def flags(world: World, name: str, value: Any) -> np.ndarray:
+    """Returns bools as an array, `[]` or `[N]`.
+
+    Raises:
+      TypeError, ValueError: if they are none, or of another shape.
+    """
+    array = np.asarray(value)
+    if array.dtype != bool:
+        raise TypeError(f"{name} must be True or False, got {value!r}.")
+    if array.shape not in {(), world.lead}:
+        raise ValueError(f"{name} must be of shape {world.lead}, got {array.shape}.")
+    return np.broadcast_to(array, world.lead)
+
+
+def last_obs(
+    world: World, next_obs: Any, done: np.ndarray, info: Mapping[str, Any] | None
+) -> np.ndarray:
+    """Returns where a step led, also where the world has begun a new trial in it.
+
+    Args:
+      world: its shapes.
+      next_obs: `[D]` or `[N, D]`, of the step.
+      done: `[]` or `[N]`, where a trial has ended.
+      info: of the step.
+
+    Raises:
+      TypeError, ValueError: if an observation is not what it should be, or the last one
+        of a trial is not there.
+    """
+    reached = numbers(world, "next_obs", next_obs)
+    if world.autoreset != "SameStep" or not done.any():
+        return reached
+    found = (info or {}).get("final_obs")
+    if found is None:
+        raise ValueError(
+            "info must have final_obs, where a trial has ended and autoreset is "
+            "SameStep, got none."
+        )
+    if world.num_envs is None:
+        return numbers(world, "info['final_obs']", found)
+    if len(found) != world.num_envs:
+        raise ValueError(
+            f"info['final_obs'] must have {world.num_envs} rows, got {len(found)}."
+        )
+    rows = [found[i] if ended else reached[i] for i, ended in enumerate(done)]
+    return numbers(world, "info['final_obs']", rows)
+
+
+def blocks(
+    steps: list[tuple[np.ndarray, ...]], size: int
+) -> Iterator[tuple[Transition, np.int32]]:
+    """Yields rows in blocks of one size, the last filled up, and how many are meant.
+
+    Args:
+      steps: `[n, D]`, `[n, A]`, `[n, D]` each, with any n.
+      size: of a block.
+    """
+    if not steps:
+        return
+    rows = [np.concatenate(column) for column in zip(*steps, strict=True)]
+    for start in range(0, len(rows[0]), size):
+        part = [column[start : start + size] for column in rows]
+        count = len(part[0])
+        filled = [np.pad(x, ((0, size - count), (0, 0))) for x in part]
+        yield Transition(*[jnp.asarray(x) for x in filled]), np.int32(count)

@@ -1,0 +1,45 @@
+"""The models that come with the library."""
+
+from pathlib import Path
+
+from jaxpets._src.checks import nearest
+from jaxpets._src.ensemble import Ensemble
+from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.model_file import load_model
+
+_SHIPPED = Path(__file__).parents[1] / "models"
+
+
+def names() -> tuple[str, ...]:
+    """Returns the names of the models that come with the library."""
+    return tuple(sorted(file.stem for file in _SHIPPED.glob("*.safetensors")))
+
+
+def path(name: str) -> Path:
+    """Returns the file of a model that comes with the library.
+
+    Raises:
+      ValueError: if there is no such model; the nearest names are said.
+    """
+    if name not in names():
+        near = ", ".join(nearest(name, names()) or names())
+        raise ValueError(f"name must be a model, as {near}, got {name!r}.")
+    return _SHIPPED / f"{name}.safetensors"
+
+
+def pretrained(name: str) -> tuple[Ensemble, EnsembleParams]:
+    """Returns a model of HalfCheetah that comes with the library.
+
+    It explored for 60 trials of 1000 steps without a reward. The numbers to plan with,
+    and how it came to be, are in `models.about(models.path(name))`.
+
+    Args:
+      name: "best" or "epistemic", the arms of the README.
+
+    Returns:
+      The ensemble and what it has learned, as `load_model`.
+
+    Raises:
+      ValueError: if there is no such model; the nearest names are said.
+    """
+    return load_model(path(name))

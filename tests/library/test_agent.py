@@ -1,0 +1,278 @@
+"""The agent of a world that is not JAX: what it remembers, learns and refuses."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import toys
+from safetensors.numpy import load_file, save_file
+
+import jaxpets
+
+ONE = np.ones(1)
+RANDOM = jaxpets.random_planner(-ONE, ONE)
+TRACES = []
+
+
+def pull(params, key, state, obs):
+    """A planner of one line: acts towards its goal; its state counts the steps."""
+    TRACES.append(obs.shape)
+    action = jnp.clip(
+        params.reward - obs[:1] + 0 * params.dynamics.scaler.low[:1], -1, 1
+    )
+    action = action + 1e-3 * state + 0 * jax.random.normal(key, (1,), jnp.float32)
+    output = jaxpets.typing.PlanOutput(action, action[None], jnp.zeros((), jnp.float32))
+    return output, state + 1
+
+
+def zero():
+    return jnp.zeros((), jnp.float32)
+
+
+PULL = jaxpets.Planner(zero, pull)
+GOAL = jaxpets.RewardData(
+    init=lambda key: zero(),
+    refresh=lambda data, params, dataset: dataset.size.astype(jnp.float32),
+)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    model = toys.small_ensemble(hidden_sizes=(4,), weight_decays=0.0)
+    config = jaxpets.FitConfig(num_epochs=1, batch_size=8)
+    return model, jaxpets.fitter(model, optax.adam(1e-3), config)
+
+
+@pytest.fixture(scope="module")
+def trained(parts):
+    """What a model that has learned knows: an agent with it plans at once."""
+    params = jax.jit(parts[0].init)(jax.random.key(5))
+    bounds = jnp.zeros(2), jnp.ones(2)
+    return params._replace(scaler=params.scaler._replace(low=bounds[0], high=bounds[1]))
+
+
+@pytest.fixture(scope="module")
+def make(parts):
+    """Builds agents, which share the compiled steps of those that are equal."""
+    return functools.partial(
+        jaxpets.agent,
+        PULL,
+        *parts,
+        random_planner=RANDOM,
+        capacity=40,
+        reward_data=GOAL,
+    )
+
+
+def rows(agent):
+    """The transitions that an agent remembers, oldest first, as x of obs and next."""
+    agent._remember()
+    dataset = agent._state.dataset
+    data = jax.tree.map(lambda x: np.asarray(x)[: int(dataset.size)], dataset.data)
+    return list(zip(data.obs[:, 0].tolist(), data.next_obs[:, 0].tolist(), strict=True))
+
+
+def at(x):
+    return np.array([x, 0.0])
+
+
+def test_it_explores_at_random_learns_plans_and_goes_on_where_it_was_saved(
+    make, tmp_path
+):
+    TRACES.clear()
+    agent, path = make(seed=3), tmp_path / "agent.safetensors"
+    with pytest.raises(RuntimeError, match="learn needs what was observed"):
+        agent.learn()
+    with pytest.raises(RuntimeError, match="observe must follow act"):
+        agent.observe(at(0))
+    drawn = []
+    for step in range(12):
+        drawn.append(agent.act(at(step)))
+        assert drawn[-1].shape == (1,) and drawn[-1].dtype == np.float32
+        # Any float will do, and what is given is not kept.
+        end = at(step + 1).astype(np.float32 if step % 2 else np.float64)
+        agent.observe(end, step == 11)
+        end[:] = 99
+    assert not TRACES and len({float(a[0]) for a in drawn}) == 12
+    assert agent.num_steps == 12
+    metrics = agent.learn()
+    assert metrics.num_updates > 0 and np.isfinite(metrics.nll)
+    assert rows(agent) == [(float(t), t + 1.0) for t in range(12)]
+    agent.save(path)
+    # The goal is the size of the dataset: it was refreshed, and now it plans.
+    assert agent.act(at(11.5)) == pytest.approx(0.5)
+    assert agent.act(at(11.5)) == pytest.approx(0.501)
+    agent.reset()
+    assert agent.act(at(11.5)) == pytest.approx(0.5)
+    # Tasks are data: neither learning nor another goal compiles again.
+    agent.perform(2.25)
+    assert agent.act(at(2.0)) == pytest.approx(0.251)
+    agent.perform(np.float32(1.5))
+    agent.observe(at(2.0))
+    agent.learn()
+    assert agent.act(at(2.0)) == pytest.approx(-0.498)
+    agent.explore()
+    assert agent.act(at(12.5)) == pytest.approx(0.503)
+    assert len(TRACES) == 1
+
+    again = make(seed=3)
+    again.load(path)
+    assert again.num_steps == 12
+    assert rows(again) == [(float(t), t + 1.0) for t in range(12)]
+    assert again.act(at(11.5)) == pytest.approx(0.5)
+    again.observe(at(2.0))
+    agent.load(path)
+    agent.act(at(11.5))
+    agent.observe(at(2.0))
+    toys.assert_trees_close(again.learn(), agent.learn(), rtol=0)
+    toys.assert_trees_close(again.params, agent.params, rtol=0)
+    with pytest.raises(
+        ValueError, match=r"agent: dataset.data.action must be \(\(3, 1"
+    ):
+        make(capacity=3).load(path)
+
+
+def test_a_file_that_is_no_agent_is_refused(make, trained, tmp_path):
+    path = tmp_path / "m"
+    agent = make(params=trained)
+    jaxpets.save_model(
+        path, toys.small_ensemble(), toys.small_ensemble().init(jax.random.key(0))
+    )
+    with pytest.raises(ValueError, match=r"no agent .* format must be 'jaxpets agent'"):
+        agent.load(path)
+    agent.save(path)
+    tensors = load_file(path)
+    good = {"format": "jaxpets agent", "version": "1"}
+    save_file(tensors, path, good | {"acts": "-1"})
+    with pytest.raises(ValueError, match="counts wrong"):
+        agent.load(path)
+    save_file(tensors, path, good | {"version": "2"})
+    with pytest.raises(ValueError, match="version must be '1', got '2'"):
+        agent.load(path)
+
+
+class Worlds:
+    """Two worlds that count; a trial of world i ends at its i-th length."""
+
+    def __init__(self, mode, lengths=(2, 3)):
+        self.mode, self.lengths = mode, np.array(lengths)
+        self.x, self.trial = np.zeros(2), np.zeros(2)
+        self.over = np.zeros(2, bool)
+
+    def obs(self, x):
+        return np.stack([100 * self.trial + x, np.zeros(2)], 1)
+
+    def start(self, which):
+        self.trial, self.x = self.trial + which, np.where(which, 0, self.x)
+        self.over = self.over & ~which
+
+    def step(self):
+        info = {}
+        moving = ~self.over if self.mode == "NextStep" else np.ones(2, bool)
+        self.start(self.over & ~moving)
+        self.x = self.x + moving
+        done = moving & (self.x == self.lengths)
+        self.over = done
+        if self.mode == "SameStep" and done.any():
+            final = self.obs(self.x)
+            info["final_obs"] = np.array(
+                [row if d else None for row, d in zip(final, done, strict=True)], object
+            )
+            self.start(done)
+        return self.obs(self.x), done, np.zeros(2, bool), info
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_no_transition_goes_from_an_end_to_a_start(make, trained, mode):
+    agent = make(num_envs=2, params=trained, autoreset=mode)
+    worlds = Worlds(mode)
+    obs, planned = worlds.obs(worlds.x), []
+    for _ in range(9):
+        action = agent.act(obs)
+        # What the planner's state adds: how many steps of this trial came before.
+        planned.append(np.round((action[:, 0] - np.clip(-obs[:, 0], -1, 1)) * 1e3))
+        obs, *done, info = worlds.step()
+        agent.observe(obs, *done, info)
+        if mode == "Disabled":
+            worlds.start(done[0])
+            obs = worlds.obs(worlds.x)
+    found = rows(agent)
+    assert all(after == before + 1 for before, after in found)
+    assert agent.num_steps == len(found)
+    lost = {"NextStep": 3 + 2, "SameStep": 0, "Disabled": 0}[mode]
+    assert len(found) == 18 - lost
+    counts = np.array(planned, int).T.tolist()
+    if mode == "NextStep":  # the step that is ignored still counts in the old trial
+        assert counts == [[0, 1, 2] * 3, [0, 1, 2, 3] * 2 + [0]]
+    else:
+        assert counts == [[0, 1] * 4 + [0], [0, 1, 2] * 3]
+
+
+def test_one_world_that_resets_in_the_step_itself(make, trained):
+    agent = make(params=trained, autoreset="SameStep")
+    agent.act(at(1.0))
+    agent.observe(at(0.0), True, info={"final_obs": at(2.0)})
+    assert rows(agent) == [(1.0, 2.0)]
+
+
+def test_another_planner_performs(make, trained):
+    agent = make(params=trained)
+    agent.perform((), jaxpets.random_planner(3 * ONE, 4 * ONE))
+    assert 3 <= agent.act(at(0.0)) <= 4
+
+
+def test_what_a_world_may_not_say(make, trained):
+    agent = make(params=trained)
+    for bad, error, words in (
+        ([0.0], ValueError, r"obs must be of shape \(2,\), got \(1,\)"),
+        ({"x": 0}, TypeError, r"obs must be numbers of shape \(2,\), got dict"),
+        ([0.0, np.nan], ValueError, r"obs must be finite, got nan in entry \[1\]"),
+        ([1e300, 0.0], ValueError, r"obs must be finite, got inf in entry \[0\]"),
+    ):
+        with pytest.raises(error, match=words):
+            agent.act(bad)
+    agent.act(at(0.0))
+    with pytest.raises(ValueError, match="next_obs must be finite"):
+        agent.observe([np.inf, 0.0])
+    with pytest.raises(TypeError, match=r"terminated must be True or False, got 1.0"):
+        agent.observe(at(1.0), 1.0)
+    with pytest.raises(
+        ValueError, match=r"truncated must be of shape \(\), got \(2,\)"
+    ):
+        agent.observe(at(1.0), False, np.zeros(2, bool))
+    agent.observe(at(1.0))  # none of it was kept
+    assert rows(agent) == [(0.0, 1.0)]
+    two = make(num_envs=2, params=trained, autoreset="SameStep")
+    two.act(np.zeros((2, 2)))
+    ended = np.array([True, False])
+    with pytest.raises(ValueError, match="info must have final_obs"):
+        two.observe(np.zeros((2, 2)), ended)
+    with pytest.raises(ValueError, match="must have 2 rows, got 1"):
+        two.observe(np.zeros((2, 2)), ended, info={"final_obs": [at(0)]})
+
+
+def test_what_an_agent_may_not_be_made_of(make, parts):
+    with pytest.raises(ValueError, match=r"autoreset must be one of .*, got 'never'"):
+        make(autoreset="never")
+    with pytest.raises(ValueError, match="num_envs must be at least 1"):
+        make(num_envs=0)
+    with pytest.raises(ValueError, match="params must"):
+        make(params=toys.small_ensemble(obs_size=3).init(jax.random.key(0)))
+    with pytest.raises(TypeError, match="planner must be a Planner"):
+        make().perform((), 3)
+
+
+def test_only_counted_rows_are_appended():
+    data = toys.transitions(4)
+    full = jaxpets.datasets.append(jaxpets.datasets.init(5, 2, 1), data)
+    one, two = jnp.int32(1), jnp.int32(2)
+    step = jaxpets.datasets.append(full, data, two)  # wraps around the end
+    assert (int(step.size), int(step.cursor)) == (5, 1)
+    np.testing.assert_array_equal(step.data.obs[jnp.array([4, 0])], data.obs[:2])
+    np.testing.assert_array_equal(step.data.obs[1:4], full.data.obs[1:4])
+    small = jaxpets.datasets.append(jaxpets.datasets.init(5, 2, 1), data, one)
+    assert (int(small.size), int(small.cursor)) == (1, 1)
+    assert not np.asarray(small.data.obs[1:]).any()
