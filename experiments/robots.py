@@ -36,7 +36,7 @@ def named(env: str, engine: str, tasks: str | None = None) -> "Robot":
     else:
         try:
             robot = envs.make(env, backend=engine)
-        except ValueError as error:
+        except (ImportError, ValueError) as error:
             raise UsageError(f"--env {env} is not valid; {error}") from error
     if tasks is None:
         return robot
@@ -54,12 +54,16 @@ def listing(engine: str) -> str:
     """Returns a line per robot: name, sizes and tasks."""
     from jaxpets import envs
 
-    robots = [named(name, engine) for name in envs.names()]
     lines = [("name", "observation", "action", "tasks")]
-    lines += [
-        (robot.name, *map(str, sizes(robot)), ", ".join(robot.tasks.names))
-        for robot in robots
-    ]
+    for name in envs.names():
+        try:
+            robot = envs.make(name, backend=engine)
+        except ImportError:
+            extra = name.partition("/")[0]
+            lines.append((name, "", "", f"needs the extra jaxpets[{extra}]"))
+            continue
+        seen, acted = map(str, sizes(robot))
+        lines.append((name, seen, acted, ", ".join(robot.tasks.names)))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)][:-1]
     return "\n".join(
         "  ".join([*(x.ljust(w) for x, w in zip(line, widths, strict=False)), line[-1]])

@@ -64,8 +64,8 @@ def _list(words: Sequence[str]) -> None:
     if list(words) != ["envs"]:
         said = " ".join(words) or "with no value"
         raise UsageError(f"--list {said} is not valid; it must be envs.")
-    with _without_gl():
-        print(robots.listing("mujoco"))
+    with _without_gl(), _plain_errors(Config()):
+        print(robots.listing("mujoco"), flush=True)
 
 
 def _dispatch(config: Config) -> None:

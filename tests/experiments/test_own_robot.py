@@ -205,8 +205,20 @@ def test_robots_are_listed(capsys):
     assert head.split() == ["name", "observation", "action", "tasks"]
     assert [line.split()[0] for line in lines] == list(envs.names())
     assert "18" in lines[0] and lines[0].endswith("front-flip, back-flip")
+    assert "stand, walk, run" in next(x for x in lines if x.startswith("dmc/walker"))
     assert main(["--list", "arms"]) == 2
     assert "--list arms is not valid; it must be envs." in capsys.readouterr().err
+
+
+def test_a_robot_whose_package_is_missing_is_one_line(monkeypatch):
+    def missing(name, **_):
+        raise ImportError("this environment needs the extra jaxpets[dmc]")
+
+    monkeypatch.setattr(envs, "make", missing)
+    with pytest.raises(UsageError, match="dmc/hopper is not valid; this environment"):
+        robots.named("dmc/hopper", "mjx")
+    (line,) = [x for x in robots.listing("mjx").splitlines() if "dmc/hopper" in x]
+    assert line.split(maxsplit=1)[1] == "needs the extra jaxpets[dmc]"
 
 
 @pytest.mark.parametrize(
