@@ -1,14 +1,13 @@
 """Arrays by name in one file of safetensors: no pickle, so that it can do nothing."""
 
+import importlib
 import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-import safetensors
-from safetensors.numpy import save
 
 # As safetensors names what is kept here.
 _DTYPES = {"F32": "float32", "I32": "int32", "U32": "uint32", "BOOL": "bool"}
@@ -56,7 +55,7 @@ def write(
         if str(row.dtype) not in _DTYPES.values():
             wanted = ", ".join(_DTYPES.values())
             raise ValueError(f"{name} must be of {wanted}, got {row.dtype}.")
-    content = save(rows, dict(metadata))
+    content = _safetensors("safetensors.numpy").save(rows, dict(metadata))
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".writing-") as folder:
         draft = Path(folder) / target.name
         draft.write_bytes(content)
@@ -89,9 +88,15 @@ def read(path: str | os.PathLike[str]) -> TensorFile:
 
 
 def _opened(path: Path) -> Any:
+    safetensors = _safetensors("safetensors")
     try:
-        return cast(Any, safetensors).safe_open(path, framework="np")
+        return safetensors.safe_open(path, framework="np")
     except safetensors.SafetensorError as error:
         raise ValueError(
             f"path must be a safetensors file, but {path} is none: {error}."
         ) from error
+
+
+def _safetensors(module: str) -> Any:
+    # Not before it is needed: all else of the library works without it.
+    return importlib.import_module(module)
