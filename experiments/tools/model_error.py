@@ -14,7 +14,6 @@ Targets are what the model of the robot predicts: changes, of most entries.
 """
 
 import argparse
-import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +26,7 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from experiments import exploration, robots, user_files
+from experiments import exploration, robots
 from experiments.build import State, build
 from experiments.config import Config
 from experiments.entries import to_json
@@ -73,7 +72,7 @@ def measure(
     configs = [exploration.config_of(RunFolder(run)) for run in runs]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
-    configs = [_without_files(config, env) for config in configs]
+    configs = [exploration.without_files(config, env) for config in configs]
     # The random trials of a seed are the same in all arms: all models know them.
     shared = max(config.random_trials for config in configs)
     found = [
@@ -98,19 +97,6 @@ def measure(
 
 def _label(config: Config) -> str:
     return metrics.arm_label(config.arm, to_json(config))
-
-
-def _without_files(config: Config, env: str | None) -> Config:
-    """Returns what a model is to be read with: no file that only a run speaks of.
-
-    What a run sought has no part in what its model predicts.
-    """
-    if user_files.is_file(config.env) and config.env != env:
-        raise UsageError(
-            f"the runs are of {config.env}, a file, which runs only if you name it: "
-            f"--env {config.env}."
-        )
-    return dataclasses.replace(config, arm="random", tasks=None)
 
 
 def _check_comparable(

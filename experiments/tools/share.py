@@ -30,7 +30,7 @@ _SETTINGS = {
 
 
 def share(
-    run: Path, path: Path, *, seed: int | None, environment: str, licence: str
+    run: Path, path: Path, *, seed: int | None, env: str | None, licence: str
 ) -> None:
     """Writes the model of an exploration run to one file.
 
@@ -38,11 +38,12 @@ def share(
       run: folder of the run.
       path: of the file.
       seed: which of the run's; None for the first.
-      environment: its name, as `jaxpets.envs.make` takes it.
+      env: the robot, which must be said if it is of a file.
       licence: of the file.
 
     Raises:
-      RunError: if the run has no checkpoint or not that seed.
+      RunError: if the run has no checkpoint or not that seed, or its robot is of a
+        file that nobody named.
     """
     folder = RunFolder(run)
     config = exploration.config_of(folder)
@@ -50,7 +51,7 @@ def share(
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
         raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
-    parts = build(config)
+    parts = build(exploration.without_files(config, env))
     template = exploration.model_of(exploration.template(config, parts))
     found = folder.restore(template, part=True)
     if found is None:
@@ -59,7 +60,7 @@ def share(
     i = config.seeds.index(seed)
     params = jax.tree.map(lambda x: x[i], state.params)
     about = {
-        "environment": environment,
+        "environment": config.env if env is None else rundir.label(env),
         "licence": licence,
         "training": _training(folder, config, seed, trial),
         "search": _search(config.task_planner),
@@ -84,7 +85,7 @@ def _training(
 ) -> dict[str, Any]:
     performed = folder.find_json(f"performed-{rundir.CONFIG}")
     return {
-        "arm": config.arm,
+        "arm": rundir.label(config.arm),
         "seed": seed,
         "num_trials": trial,
         "trial_length": config.trial_length,
@@ -111,10 +112,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("run", type=Path, help="folder of an exploration run")
     parser.add_argument("file", type=Path, help="as model.safetensors")
     parser.add_argument("--seed", type=int, help="by default the run's first")
-    parser.add_argument("--environment", default="pets/half_cheetah", help="its name")
+    parser.add_argument("--env", help="the robot of the run, if it is of a file")
     parser.add_argument("--licence", default="Apache-2.0", help="of the file")
     args = parser.parse_args(argv)
-    options = {"environment": args.environment, "licence": args.licence}
+    options = {"env": args.env, "licence": args.licence}
     try:
         share(args.run, args.file, seed=args.seed, **options)
     except RunError as error:

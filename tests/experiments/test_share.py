@@ -1,6 +1,8 @@
 """A run's model as one file: what comes with the library is what performed."""
 
 import dataclasses
+import json
+import shutil
 
 import jax
 import numpy as np
@@ -55,3 +57,15 @@ def test_a_run_without_what_is_asked_is_an_error(tmp_path, capsys):
     source = str(cli.PRETRAINED / "best")
     assert share.main([source, str(tmp_path / "m"), "--seed", "7"]) == 2
     assert "--seed 7 is not valid; it must be one of 1." in capsys.readouterr().err
+
+
+def test_a_file_that_only_a_run_speaks_of_does_not_run(tmp_path, capsys):
+    """The run may be a stranger's."""
+    run, file = tmp_path / "run", tmp_path / "robot.py"
+    file.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    shutil.copytree(cli.PRETRAINED / "best", run)
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(config | {"env": str(file)}))
+    assert share.main([str(run), str(tmp_path / "m")]) == 2
+    assert f"name it: --env {file}." in capsys.readouterr().err
+    assert not (tmp_path / "ran").exists()
