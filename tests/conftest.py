@@ -40,7 +40,7 @@ os.environ["XDG_CACHE_HOME"] = os.environ["JAX_COMPILATION_CACHE_DIR"]
 UNTRACED = {
     "library": ("transforms", "sweeps", "properties"),
     "kernel": ("fused_transforms",),
-    "experiments": ("devices", "hosts", "refit"),
+    "experiments": ("devices", "experiments", "hosts", "refit"),
     "benchmarks": ("accuracy", "benchmarks", "figure"),
     "examples": ("examples",),
     "faults": ("faults",),

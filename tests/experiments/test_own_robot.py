@@ -199,7 +199,9 @@ def test_an_arm_that_seeks_a_task_gets_the_constants_of_the_trial(arm):
     assert after == envs.with_constants(before, goal)
 
 
-def test_robots_are_listed(capsys):
+def test_robots_are_listed(capsys, monkeypatch):
+    some = ("pets/half_cheetah", "dmc/walker", "gym/Hopper-v5")
+    monkeypatch.setattr(envs, "names", lambda: some)
     assert main(["--list", "envs"]) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert head.split() == ["name", "observation", "action", "tasks"]

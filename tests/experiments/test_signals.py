@@ -136,6 +136,8 @@ def test_what_cannot_be_raised_is_not_printed(capsys):
 
 
 def test_what_a_thread_of_a_failed_save_logs_later_is_not_shown(caplog):
+    caplog.set_level(logging.ERROR, logger="absl")
+
     def late():
         logging.getLogger("absl").exception("the disk refused what nobody waits for")
 

@@ -24,9 +24,7 @@ pytestmark = needs_cpu
 BLOCK = 32
 
 
-@pytest.mark.parametrize(
-    "hidden_sizes", [(1,), (5, 6), (7, 13, 1), (12, 257), (300, 300), (8,) * 9]
-)
+@pytest.mark.parametrize("hidden_sizes", [(1,), (7, 13, 1), (12, 257), (8,) * 9])
 def test_any_width_and_depth_will_do(hidden_sizes):
     """Of tiles of six outputs: none, whole ones, and what is left beside them."""
     case = dataclasses.replace(SMALL, hidden_sizes=hidden_sizes)

@@ -5,29 +5,32 @@ As a script it does so at length, and prints the largest differences:
     PYTHONPATH=.:tests/library python tests/library/dmc_judge.py [mjx] [name ...]
 """
 
-import os
 import sys
-
-os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is drawn
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import parity
-from dm_control.mujoco.wrapper.mjbindings import sizes
+import pytest
 
 from jaxpets import envs
 from jaxpets.envs.dmc import DOMAINS
 
-# dm_control 1.0.50 lists arrays that MuJoCo 4 no longer has, of flexible bodies.
-_MODEL = mujoco.MjModel.from_xml_string("<mujoco/>")
-for _name, _thing in (("mjmodel", _MODEL), ("mjdata", mujoco.MjData(_MODEL))):
-    for _field in list(sizes.array_sizes[_name]):
-        if not hasattr(_thing, _field):
-            del sizes.array_sizes[_name][_field]
+# dm_control asks for OpenGL when it is imported, and nothing is drawn here. Only then:
+# tests of videos are in the same process.
+with pytest.MonkeyPatch.context() as _patch:
+    _patch.setenv("MUJOCO_GL", "disable")
+    from dm_control.mujoco.wrapper.mjbindings import sizes
 
-from dm_control import suite  # noqa: E402
+    # dm_control 1.0.50 lists arrays that MuJoCo 4 no longer has, of flexible bodies.
+    _model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    for _name, _thing in (("mjmodel", _model), ("mjdata", mujoco.MjData(_model))):
+        for _field in list(sizes.array_sizes[_name]):
+            if not hasattr(_thing, _field):
+                del sizes.array_sizes[_name][_field]
+
+    from dm_control import suite
 
 # Tasks of ours as another sign of one of the judge's, and those that are ours alone.
 MIRRORED = {

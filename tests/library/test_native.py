@@ -355,7 +355,7 @@ def test_a_model_with_more_state_is_refused():
 @pytest.mark.parametrize(("engine", "calls"), [("mjx", 0), ("mujoco", 1)])
 def test_experiments_choose_the_engine(engine, calls):
     config = dataclasses.replace(PRESETS["smoke"], phase="explore", engine=engine)
-    env = build(config).env
+    env = build(config).robot.env
     state = jax.eval_shape(env.reset, jax.random.key(0))
     program = jax.make_jaxpr(env.step)(state, jnp.zeros(6, jnp.float32))
     assert str(program).count("pure_callback[") == calls
