@@ -301,7 +301,10 @@ def _check_task(folder, labels, trials=2):
 
 
 # Each is made of the parts of another one; test_build.py has them fit.
-LIKE_ANOTHER = ("epistemic", "best", "info-gain", "ensemble-std", "one-step", "opax")
+LIKE_ANOTHER = (
+    "epistemic", "best", "info-gain", "ensemble-std", "one-step", "jensen-renyi",
+    "opax", "particle-entropy", "oracle",
+)  # fmt: skip
 
 
 @pytest.mark.slow

@@ -154,7 +154,6 @@ CASES = {
     "one particle of each": dataclasses.replace(SMALL, particles=1, horizon=1),
     "one candidate": dataclasses.replace(SMALL, num_samples=1),
     "obs 7": Case(obs_size=7, action_size=1, hidden_sizes=(16, 16, 16)),
-    "obs 8": Case(obs_size=8),
     "obs 16": Case(obs_size=16, action_size=3, hidden_sizes=(64,)),
     "half_cheetah": CHEETAH,
     "rich": Case(obs_size=4, space=RICH),
