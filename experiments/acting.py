@@ -78,7 +78,7 @@ def evaluators(
     The task's params are `[K]`. The model is `[S]` where all tasks share it, else
     `[S, K]`.
     """
-    env_of = functools.partial(_at_start, robot)
+    env_of = functools.partial(at_start, robot)
     start, chunk = _one(env_of, planner, horizon, length, with_constants)
     model = None if shared_model else 0
     over_trials = jax.vmap(chunk, (None, 0, 0))
@@ -129,13 +129,13 @@ def constants(robot: Robot, tasks: Any, keys: Array) -> Any:
     """Returns what is drawn for trials `[S, K, R]` of tasks `[K]`, as `run` has it."""
 
     def drawn(task: Any, key: Array) -> Any:
-        return _at_start(robot, task).reset(key).constants
+        return at_start(robot, task).reset(key).constants
 
     of_task = jax.vmap(jax.vmap(drawn, (None, 0)))
     return jax.jit(jax.vmap(of_task, (None, 0)))(tasks, split_keys(keys)[0])
 
 
-def _at_start(robot: Robot, task: Any) -> jaxpets.Env:
+def at_start(robot: Robot, task: Any) -> jaxpets.Env:
     """Returns the environment as it starts trials of one task."""
     if robot.task_reset is None:
         return robot.env

@@ -17,21 +17,28 @@ class Look(NamedTuple):
 Draw = Callable[[np.ndarray], np.ndarray]  # qpos [Q] -> picture [height, width, 3]
 
 
-def open_renderer(model: Any, look: Look) -> Draw:
-    """Returns what draws a robot; fails, in many ways, where OpenGL does not work."""
+def open_renderer(model: Any, look: Look, camera: str | None) -> Draw:
+    """Returns what draws a robot; fails, in many ways, where OpenGL does not work.
+
+    Args:
+      model: a compiled MuJoCo model.
+      look: of the pictures.
+      camera: of the model; None for one that suits it.
+    """
     import mujoco
 
     gl: Any = mujoco  # its stubs lack half of it
     model.vis.global_.offwidth, model.vis.global_.offheight = look.width, look.height
     renderer, data = gl.Renderer(model, look.height, look.width), gl.MjData(model)
-    camera, period = _camera(model), _floor_period(model)
+    view = _camera(model) if camera is None else camera
+    period = _floor_period(model)
 
     def draw(qpos: np.ndarray) -> np.ndarray:
         data.qpos[:] = qpos
         if period is not None:
             data.qpos[0] %= period
         gl.mj_forward(model, data)
-        renderer.update_scene(data, camera=camera)
+        renderer.update_scene(data, camera=view)
         return renderer.render()
 
     return draw

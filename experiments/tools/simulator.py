@@ -49,12 +49,12 @@ class Arguments:
 
 def perform(args: Arguments, robot: Robot) -> np.ndarray:
     """Returns the returns `[K, R]` of R trials of each of the K tasks."""
-    env, tasks = robot.env, robot.tasks
-    score = acting.scorer(robot).score
-    search = optimizer(args.task_planner, env)
-    planner = jaxpets.plan(env_rollout(env), tasks.reward_fn, search)
+    tasks, score = robot.tasks, acting.scorer(robot).score
+    search = optimizer(args.task_planner, robot.env)
+    planner = jaxpets.plan(env_rollout(robot.env), tasks.reward_fn, search)
 
     def trial(task: Any, key: jax.Array) -> jax.Array:
+        env = acting.at_start(robot, task)
         reset_key, act_key = jax.random.split(key)
         start = jaxpets.start_trial(env, planner, reset_key)
         constants = start.env.constants

@@ -241,7 +241,7 @@ def _opened(env: str | None, obs: np.ndarray, look: Look) -> tuple[Draw, np.ndar
         robot = robots.named(env or HALF_CHEETAH, "mujoco")
         if robot.model is None or robot.qpos_fn is None:
             raise UsageError(f"--env {env} has no model that can be drawn.")
-        draw = open_renderer(robot.model, look)
+        draw = open_renderer(robot.model, look, robot.camera)
     except RunError:
         raise
     except Exception as error:  # ImportError, RuntimeError, AttributeError, ...
