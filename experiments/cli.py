@@ -151,17 +151,9 @@ def _explored(config: Config) -> Config:
     own = from_json(data, config, str(path))
     explored = from_json(data, preset_config(own.preset, own.arm), str(path))
     for entry in ("env", "arm"):
-        _check_said(entry, getattr(config, entry), getattr(explored, entry), path)
+        said, found = getattr(config, entry), getattr(explored, entry)
+        user_files.check_named(flag(entry), said, found, path)
     return Config(**vars(part(explored, Science)), **vars(part(explored, Compute)))
-
-
-def _check_said(entry: str, said: str, found: str, where: Path) -> None:
-    """Refuses to run a file of which only the config of a run speaks."""
-    if user_files.is_file(found) and said != found:
-        raise UsageError(
-            f"{where} has {found}, a file, which runs only if you name it: "
-            f"{flag(entry)} {found}."
-        )
 
 
 def _check_pretrained(config: Config) -> None:

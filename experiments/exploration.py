@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,7 +12,6 @@ from experiments import user_files
 from experiments.build import EXPLORE, Parts, State, build, trial_keys
 from experiments.config import Config
 from experiments.entries import from_json
-from experiments.errors import UsageError
 from experiments.presets import PRESETS
 from experiments.storage import rundir
 from experiments.storage.folder import RunFolder
@@ -26,23 +26,20 @@ def config_of(run: RunFolder) -> Config:
     return from_json(run.config(), PRESETS["smoke"], str(run.path / rundir.CONFIG))
 
 
-def without_files(config: Config, env: str | None) -> Config:
+def without_files(config: Config, env: str | None, run: Path) -> Config:
     """Returns what a model is to be read with: no file that only a run speaks of.
 
     What a run sought has no part in what its model predicts.
 
     Args:
-      config: of a run, which may come from a stranger.
+      config: of the run, which may come from a stranger.
       env: the robot that the command line names.
+      run: its folder.
 
     Raises:
       UsageError: if the robot is of a file that it does not name.
     """
-    if user_files.is_file(config.env) and config.env != env:
-        raise UsageError(
-            f"the run is of {config.env}, a file, which runs only if you name it: "
-            f"--env {config.env}."
-        )
+    user_files.check_named("--env", env, config.env, run / rundir.CONFIG)
     return dataclasses.replace(config, arm="random", tasks=None)
 
 

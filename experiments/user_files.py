@@ -24,6 +24,25 @@ def is_file(text: str | None) -> bool:
     return _FORM.fullmatch(text or "") is not None
 
 
+def check_named(flag: str, said: str | None, found: str, where: Path) -> None:
+    """Refuses to run a file of which only the config of a run speaks.
+
+    Args:
+      flag: that would name it.
+      said: what the command line has there.
+      found: what the config has.
+      where: is the config.
+
+    Raises:
+      UsageError: if that is a file, and another or none is said.
+    """
+    if is_file(found) and said != found:
+        raise UsageError(
+            f"{where} has {found}, a file, which runs only if you name it: "
+            f"{flag} {found}."
+        )
+
+
 def made(
     flag: str, text: str, name: str, check: Callable[[Any], T], *args: Any
 ) -> T:  # fmt: skip

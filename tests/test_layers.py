@@ -70,7 +70,7 @@ LAYERS = {
     "envs.symmetry": 1,
     "envs.observations": 2,
     "envs.engines": 2,
-    "envs.half_cheetah": 3,
+    "envs.half_cheetah": 4,
     "envs.mujoco_env": 3,
     "envs.adapters": 2,
     "envs.robot": 2,

@@ -72,7 +72,10 @@ def measure(
     configs = [exploration.config_of(RunFolder(run)) for run in runs]
     labels = [_label(config) for config in configs]
     _check_comparable(runs, configs, labels)
-    configs = [exploration.without_files(config, env) for config in configs]
+    configs = [
+        exploration.without_files(config, env, run)
+        for config, run in zip(configs, runs, strict=True)
+    ]
     # The random trials of a seed are the same in all arms: all models know them.
     shared = max(config.random_trials for config in configs)
     found = [

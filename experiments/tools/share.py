@@ -51,7 +51,7 @@ def share(
     if seed not in config.seeds:
         valid = ", ".join(map(str, config.seeds))
         raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
-    parts = build(exploration.without_files(config, env))
+    parts = build(exploration.without_files(config, env, run))
     template = exploration.model_of(exploration.template(config, parts))
     found = folder.restore(template, part=True)
     if found is None:

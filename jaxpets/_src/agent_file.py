@@ -35,7 +35,7 @@ def write(path: str | os.PathLike[str], state: LearnerState, counts: Counts) -> 
     Raises:
       ValueError: for data of a reward whose dtype such a file does not have.
     """
-    arrays = {name: np.asarray(leaf) for name, leaf in _named(state).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in tensor_file.named(state).items()}
     texts = {name: str(count) for name, count in counts._asdict().items()}
     tensor_file.write(path, arrays, _FORMAT | texts)
 
@@ -51,7 +51,7 @@ def read(
     """
     file = tensor_file.read(path)
     counts = _counts(file)
-    wanted = _named(template)
+    wanted = tensor_file.named(template)
     for name in sorted(wanted.keys() | file.shapes.keys()):
         leaf = wanted.get(name)
         want = None if leaf is None else (tuple(leaf.shape), str(leaf.dtype))
@@ -79,9 +79,3 @@ def _counts(file: tensor_file.TensorFile) -> Counts:
     if not all(text.isascii() and text.isdigit() and len(text) < 10 for text in texts):
         raise ValueError(f"{file.path} is no agent that can be read: it counts wrong.")
     return Counts(*map(int, texts))
-
-
-def _named(state: LearnerState) -> dict[str, Any]:
-    """Returns the leaves by their places, in their order."""
-    leaves = cast(list[Any], jax.tree_util.tree_leaves_with_path(state))
-    return {jax.tree_util.keystr(p, simple=True, separator="."): x for p, x in leaves}

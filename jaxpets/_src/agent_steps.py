@@ -10,11 +10,11 @@ import numpy as np
 from jax import Array
 
 from jaxpets._src import dataset as datasets
-from jaxpets._src.checks import check_array, check_like
+from jaxpets._src.checks import check_array
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.fitter import FitMetrics, Fitter
-from jaxpets._src.learner import LearnerState, RewardData
+from jaxpets._src.learner import LearnerState, RewardData, fitted, new_state
 from jaxpets._src.types import Planner, PlanParams, Transition
 
 # `(key, number, is_new, PlanParams, state, obs) -> (action, state)`.
@@ -44,23 +44,11 @@ def agent_steps(
 ) -> AgentSteps:
     """Builds what an agent computes apart from acting; see `agent`."""
 
-    def init(key: Array, params: EnsembleParams | None) -> LearnerState:
-        model_key, reward_key = jax.random.split(key)
-        params = model.init(model_key) if params is None else params
-        dataset = datasets.init(capacity, model.obs_size, model.action_size)
-        reward = reward_data.refresh(reward_data.init(reward_key), params, dataset)
-        return LearnerState(params, fitter.init(params), dataset, reward)
-
     def append(state: LearnerState, rows: Transition, count: Array) -> LearnerState:
         return state._replace(dataset=datasets.append(state.dataset, rows, count))
 
-    def learn(key: Array, state: LearnerState) -> tuple[LearnerState, FitMetrics]:
-        params, fit, metrics = fitter.step(state.params, key, state.fit, state.dataset)
-        reward = reward_data.refresh(state.reward, params, state.dataset)
-        # Another shape would retrace every plan.
-        check_like("reward_data.refresh's result", reward, state.reward)
-        return LearnerState(params, fit, state.dataset, reward), metrics
-
+    init = functools.partial(new_state, model, fitter, reward_data, capacity)
+    learn = functools.partial(fitted, fitter, reward_data)
     return AgentSteps(model.action_size, init, append, learn)
 
 

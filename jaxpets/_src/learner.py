@@ -137,11 +137,7 @@ def learner(
 
     def init(key: Array) -> LearnerState:
         check_key("key", key)
-        model_key, reward_key = jax.random.split(key)
-        params = ensemble.init(model_key)
-        dataset = datasets.init(capacity, *sizes)
-        reward = reward_data.refresh(reward_data.init(reward_key), params, dataset)
-        return LearnerState(params, fitter.init(params), dataset, reward)
+        return new_state(ensemble, fitter, reward_data, capacity, key)
 
     def learn(
         key: Array, state: LearnerState, transitions: Transition
@@ -149,11 +145,7 @@ def learner(
         check_key("key", key)
         check_record("state", state, LearnerState)
         dataset = datasets.append(state.dataset, transitions)
-        params, fit, metrics = fitter.step(state.params, key, state.fit, dataset)
-        reward = reward_data.refresh(state.reward, params, dataset)
-        # Another shape would retrace every trial.
-        check_like("reward_data.refresh's result", reward, state.reward)
-        return LearnerState(params, fit, dataset, reward), metrics
+        return fitted(fitter, reward_data, key, state._replace(dataset=dataset))
 
     def step(
         planner: Planner, key: Array, state: LearnerState
@@ -170,3 +162,30 @@ def learner(
         return state, TrialOutput(transitions, plans, metrics)
 
     return Learner(init, learn, step)
+
+
+def new_state(
+    ensemble: Ensemble,
+    fitter: Fitter,
+    reward_data: RewardData,
+    capacity: int,
+    key: Array,
+    params: EnsembleParams | None = None,
+) -> LearnerState:
+    """Returns a learner without data; params are what its model has learned before."""
+    model_key, reward_key = jax.random.split(key)
+    params = ensemble.init(model_key) if params is None else params
+    dataset = datasets.init(capacity, ensemble.obs_size, ensemble.action_size)
+    reward = reward_data.refresh(reward_data.init(reward_key), params, dataset)
+    return LearnerState(params, fitter.init(params), dataset, reward)
+
+
+def fitted(
+    fitter: Fitter, reward_data: RewardData, key: Array, state: LearnerState
+) -> tuple[LearnerState, FitMetrics]:
+    """Returns a learner after a fit to its data, with the reward in step."""
+    params, fit, metrics = fitter.step(state.params, key, state.fit, state.dataset)
+    reward = reward_data.refresh(state.reward, params, state.dataset)
+    # Another shape would retrace every plan.
+    check_like("reward_data.refresh's result", reward, state.reward)
+    return LearnerState(params, fit, state.dataset, reward), metrics

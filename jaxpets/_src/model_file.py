@@ -58,7 +58,9 @@ def save_model(
             "an ensemble of your own."
         )
     params_check(model.init)(params)
-    arrays = {name: np.asarray(array) for name, array in _named(params).items()}
+    arrays = {
+        name: np.asarray(array) for name, array in tensor_file.named(params).items()
+    }
     _check_no_nan("params", arrays)
     facts = {
         "config": {name: getattr(config, name) for name in _CONFIG}
@@ -108,7 +110,7 @@ def load_model(
         _refuse(file, f"its networks read {found} numbers, but get {num_inputs}")
     arrays = file.arrays()
     _check_no_nan(str(file.path), arrays)
-    leaves = [jnp.asarray(arrays[name]) for name in _named(template)]
+    leaves = [jnp.asarray(arrays[name]) for name in tensor_file.named(template)]
     structure = cast(Any, jax.tree.structure(template))
     params = cast(EnsembleParams, jax.tree.unflatten(structure, leaves))
     return model, params
@@ -124,12 +126,6 @@ def about(path: str | os.PathLike[str]) -> dict[str, Any]:
     file = tensor_file.read(path)
     _check_format(file)
     return _object(file, "about")
-
-
-def _named(params: Any) -> dict[str, Any]:
-    """Returns the leaves of an EnsembleParams by their places in it."""
-    leaves = cast(list[Any], jax.tree_util.tree_leaves_with_path(params))
-    return {jax.tree_util.keystr(p, simple=True, separator="."): x for p, x in leaves}
 
 
 def _space_to_json(space: ModelSpace) -> Any:

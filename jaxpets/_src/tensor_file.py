@@ -5,8 +5,9 @@ import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import jax
 import numpy as np
 
 # As safetensors names what is kept here.
@@ -85,6 +86,12 @@ def read(path: str | os.PathLike[str]) -> TensorFile:
                 )
             dtypes[name] = _DTYPES[dtype]
         return TensorFile(source, dict(file.metadata() or {}), shapes, dtypes)
+
+
+def named(tree: Any) -> dict[str, Any]:
+    """Returns the leaves of a pytree by their places in it, in its order."""
+    leaves = cast(list[Any], jax.tree_util.tree_leaves_with_path(tree))
+    return {jax.tree_util.keystr(p, simple=True, separator="."): x for p, x in leaves}
 
 
 def _opened(path: Path) -> Any:

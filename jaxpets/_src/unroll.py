@@ -1,5 +1,6 @@
 """An environment and a planner, stepped together in one scan."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -141,9 +142,5 @@ def _begun_anew(
     if jnp.shape(ended) != () or jnp.result_type(ended) != jnp.bool_:
         got = f"{jnp.result_type(ended)}{list(jnp.shape(ended))}"
         raise ValueError(f"env.terminal_fn must return bool[], got {got}.")
-
-    def chosen(new: Array, old: Array) -> Array:
-        return jnp.where(ended, new, old)
-
     fresh = UnrollState(reset(env, key), planner.init(), state.step)
-    return jax.tree.map(chosen, fresh, state)
+    return jax.tree.map(functools.partial(jnp.where, ended), fresh, state)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets.envs.mujoco_env import ConstantsFn, ResetFn
+from jaxpets.envs.starts import drawn_until
 
 _SPEED = 0.005
 _OBJECT = ("obj_slidey", "obj_slidex")
@@ -78,18 +79,17 @@ def pusher(model: Any) -> ResetFn:
     high = jnp.asarray([0.0, 0.2], jnp.float32)
     rest = jnp.asarray(model.qpos0, jnp.float32)
 
-    def again(tried: tuple[Array, Array]) -> tuple[Array, Array]:
-        key, own_key = jax.random.split(tried[0])
-        return key, jax.random.uniform(own_key, (2,), jnp.float32, low, high)
+    def anywhere(key: Array) -> Array:
+        return jax.random.uniform(key, (2,), jnp.float32, low, high)
 
-    def too_near(tried: tuple[Array, Array]) -> Array:
-        return jnp.sum(tried[1] ** 2) <= 0.17**2
+    def is_near(place: Array) -> Array:
+        return jnp.sum(place**2) <= 0.17**2
+
+    object_fn = drawn_until(anywhere, is_near)
 
     def start(key: Array) -> tuple[Array, Array]:
         key, qvel_key = jax.random.split(key)
-        _, place = jax.lax.while_loop(
-            too_near, again, (key, jnp.zeros((2,), jnp.float32))
-        )
+        place = object_fn(key)
         moving = len(_ARM)
         qvel = jnp.zeros((model.nv,), jnp.float32)
         qvel = qvel.at[:moving].set(_even(qvel_key, moving, _SPEED))

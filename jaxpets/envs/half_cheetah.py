@@ -6,19 +6,17 @@ the same state; nothing ends a trial; all geoms hit the floor (not so in Brax).
 """
 
 import importlib.resources
-from collections.abc import Callable
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count, check_key, check_record
+from jaxpets._src.checks import check_array, check_count, check_record
 from jaxpets._src.coordinates import space
-from jaxpets._src.types import Env, EnvState, ModelSpace
-from jaxpets.envs.engines import Physics, mjx_engine, native_engine
+from jaxpets._src.types import Env, ModelSpace
 from jaxpets.envs.extra import needs_extra
+from jaxpets.envs.mujoco_env import mujoco_env
 from jaxpets.envs.observations import DEFAULT, readings
 
 with needs_extra():
@@ -38,8 +36,6 @@ Z_VELOCITY = 10  # m/s
 PITCH_RATE = 11  # rad/s, positive rolls forward
 JOINT_VELOCITIES = slice(12, 18)  # rad/s
 
-_FRAME_SKIP = 5
-_RESET_STD = 0.001
 # 1000 kg/m^3 (MuJoCo's default) scaled to the total mass of 14 kg that the file asks
 # for by `settotalmass`, an attribute MuJoCo is about to drop.
 _DENSITY = "660.8849500774735"
@@ -159,7 +155,7 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     model = load_model()
     model.opt.iterations = iterations
     model.opt.ls_iterations = ls_iterations
-    return _env(model, mjx_engine(model, num_substeps=_FRAME_SKIP).advance)
+    return mujoco_env(model, control_step=TIMESTEP, backend="mjx")
 
 
 def half_cheetah_native(*, num_threads: int | None = None) -> Env:
@@ -180,36 +176,7 @@ def half_cheetah_native(*, num_threads: int | None = None) -> Env:
     Raises:
       TypeError, ValueError: unless num_threads is None or a positive Python integer.
     """
-    model = load_model()
-    engine = native_engine(model, num_substeps=_FRAME_SKIP, num_threads=num_threads)
-    return _env(model, engine.advance)
-
-
-def _env(model: Any, advance: Callable[[Physics, Array], Physics]) -> Env:
-    """Builds the environment around what moves the physics by one step."""
-    qpos0 = jnp.asarray(model.qpos0, jnp.float32)
-
-    def observe(velocity: Array, physics: Physics) -> Array:
-        return jnp.concatenate([velocity[None], physics.qpos[1:], physics.qvel])
-
-    def reset(key: Array) -> EnvState:
-        check_key("key", key)
-        qpos_key, qvel_key = jax.random.split(key)
-        physics = Physics(
-            qpos=qpos0 + _RESET_STD * jax.random.normal(qpos_key, (9,), jnp.float32),
-            qvel=_RESET_STD * jax.random.normal(qvel_key, (9,), jnp.float32),
-            qacc_warmstart=jnp.zeros((9,), jnp.float32),
-        )
-        return EnvState(observe(jnp.zeros((), jnp.float32), physics), physics)
-
-    def step(state: EnvState, action: Array) -> EnvState:
-        check_array("action", action, [ACTION_SIZE])
-        physics = advance(state.physics, action)
-        velocity = (physics.qpos[0] - state.physics.qpos[0]) / TIMESTEP
-        return EnvState(observe(velocity, physics), physics)
-
-    low = -jnp.ones((ACTION_SIZE,), jnp.float32)
-    return Env(reset, step, action_low=low, action_high=-low)
+    return mujoco_env(load_model(), control_step=TIMESTEP, num_threads=num_threads)
 
 
 def qpos_from_obs(obs: Array) -> Array:

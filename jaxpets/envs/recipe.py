@@ -1,5 +1,6 @@
 """A robot from a table: what is observed, earned and drawn of a MuJoCo model."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -112,17 +113,11 @@ def _task_reset(
         for other, tasks in elsewhere:
             numbers = np.array([names.index(name) for name in tasks], np.int32)
             is_there = jnp.isin(task, numbers)
-            state = _where(is_there, other.reset(key), state)
+            chosen = functools.partial(jnp.where, is_there)
+            state = jax.tree.map(chosen, other.reset(key), state)
         return state
 
     return task_reset
-
-
-def _where(condition: Array, a: EnvState, b: EnvState) -> EnvState:
-    def pick(x: Array, y: Array) -> Array:
-        return jnp.where(condition, x, y)
-
-    return jax.tree.map(pick, a, b)
 
 
 def _repeated(reward_fn: RewardFn, action_repeat: int) -> RewardFn:

@@ -47,6 +47,30 @@ def random_joints(model: Any, *, only_limited: bool = False) -> PostureFn:
     return draw
 
 
+def drawn_until(
+    draw: Callable[[Array], Array], is_refused: Callable[[Array], Array]
+) -> Callable[[Array], Array]:
+    """Draws again while what was drawn will not do.
+
+    Args:
+      draw: `(key) -> x`; it must come to one that will do.
+      is_refused: `(x) -> []`, whether it will not.
+
+    Returns:
+      `(key) -> x`.
+    """
+
+    def again(tried: tuple[Array, Array]) -> tuple[Array, Array]:
+        key, own_key = jax.random.split(tried[0])
+        return key, draw(own_key)
+
+    def drawn(key: Array) -> Array:
+        first = again((key, jnp.zeros(())))
+        return jax.lax.while_loop(lambda tried: is_refused(tried[1]), again, first)[1]
+
+    return drawn
+
+
 def without_contact(model: Any, posture_fn: PostureFn) -> PostureFn:
     """Draws until nothing touches, as C MuJoCo finds it, whatever steps the trial.
 
@@ -57,17 +81,7 @@ def without_contact(model: Any, posture_fn: PostureFn) -> PostureFn:
     Returns:
       `(key) -> qpos [Q]`.
     """
-    touches = _touches(model)
-
-    def draw(key: Array) -> Array:
-        def again(tried: tuple[Array, Array]) -> tuple[Array, Array]:
-            key, own_key = jax.random.split(tried[0])
-            return key, posture_fn(own_key)
-
-        first = again((key, jnp.zeros((model.nq,), jnp.float32)))
-        return jax.lax.while_loop(lambda tried: touches(tried[1]), again, first)[1]
-
-    return draw
+    return drawn_until(posture_fn, _touches(model))
 
 
 def lifted(model: Any, posture_fn: PostureFn, place: int) -> PostureFn:

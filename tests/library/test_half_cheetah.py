@@ -10,7 +10,7 @@ from c_mujoco import c_step, visited_states
 
 import jaxpets
 from jaxpets.envs import half_cheetah as hc
-from jaxpets.envs.half_cheetah import Physics
+from jaxpets.envs.engines import Physics
 
 STATES = 500
 JOINTS = ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]

@@ -19,6 +19,7 @@ from experiments.build import build
 from experiments.presets import PRESETS
 from jaxpets.envs import env_rollout, native
 from jaxpets.envs import half_cheetah as hc
+from jaxpets.envs.engines import Physics
 
 STATES = 200
 # The physics is the same to the bit, wherever it is called from. XLA may divide by the
@@ -42,7 +43,7 @@ def states(model):
     qpos, qvel, warmstart = visited_states(model, STATES)
     velocity = np.zeros_like(qpos[:, :1])
     obs = np.concatenate([velocity, qpos[:, 1:], qvel], axis=-1)
-    state = jaxpets.EnvState(obs, hc.Physics(qpos, qvel, warmstart))
+    state = jaxpets.EnvState(obs, Physics(qpos, qvel, warmstart))
     return jax.tree.map(jnp.asarray, state)
 
 
@@ -85,7 +86,7 @@ def test_the_warm_start_goes_in_and_comes_out(states, actions):
     model = hc.load_model()
     model.opt.iterations = 1
     step = jax.jit(jax.vmap(native.native_physics(model, num_substeps=2)))
-    got = hc.Physics(*step(*states.physics, actions))
+    got = Physics(*step(*states.physics, actions))
     data = mujoco.MjData(model)
     for i in range(0, STATES, 9):
         mujoco.mj_resetData(model, data)
@@ -123,7 +124,7 @@ def test_what_is_not_finite_is_nan_and_stays_alone(env, states, actions, after):
     count = 8
     state, action = first(count, (states, actions))
     qpos, qvel, warmstart, _ = state.physics
-    physics = hc.Physics(
+    physics = Physics(
         qpos.at[0, 4].set(jnp.nan),
         qvel.at[1, 3].set(jnp.inf).at[2].set(1e9),  # C resets what is too fast
         warmstart.at[3, 0].set(jnp.nan),
