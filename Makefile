@@ -4,6 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 PYTEST_FLAGS ?=
+COVERAGE ?=
 
 .PHONY: explore results test faults lint clean
 
@@ -27,7 +28,7 @@ results: $(VENV)/.installed
 	$(BIN)/python -m experiments.report.method_figure results/method.svg
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)
+	$(BIN)/python $(COVERAGE) -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)
 
 # Hours: what is lost where anything fails while a run writes. See results/faults.md.
 faults: $(VENV)/.installed

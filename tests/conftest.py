@@ -35,17 +35,6 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 # Kernels are built for this run too, and not kept in the user's cache folder.
 os.environ["XDG_CACHE_HOME"] = os.environ["JAX_COMPILATION_CACHE_DIR"]
 
-# What is traced for coverage takes a third longer. These files are not: each line that
-# they reach others reach as well.
-UNTRACED = {
-    "library": ("transforms", "sweeps", "properties"),
-    "kernel": ("fused_transforms",),
-    "experiments": ("devices", "experiments", "hosts", "refit"),
-    "benchmarks": ("accuracy", "benchmarks", "figure"),
-    "examples": ("examples",),
-    "faults": ("faults",),
-}
-
 # Last on the path, so that an installed wheel is what gets tested; the experiments
 # and benchmarks are not in the wheel.
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -68,15 +57,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     A worker takes whole files: none is to be left alone with a long one at the end.
     """
-    here = Path(__file__).parent
-    untraced = {
-        here / room / f"test_{name}.py"
-        for room, names in UNTRACED.items()
-        for name in names
-    }
-    for item in items:
-        if item.path in untraced:
-            item.add_marker(pytest.mark.no_cover)
     slow = {item.path for item in items if "slow" in item.keywords}
     items.sort(key=lambda item: item.path not in slow)
     if any(device.platform == "gpu" for device in jax.devices()):
