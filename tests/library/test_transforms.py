@@ -11,6 +11,7 @@ from cases import CASES, KEYED, STATEFUL
 # Programs that fuse otherwise round otherwise; a search of a few iterations on values
 # that differ by far more than a rounding keeps to 1e-4.
 CLOSE = dict(rtol=1e-4, atol=1e-5)
+UNROLLED = ("icem", "plan-icem", "cem-unrolled", "plan-cem-unrolled")
 
 
 @functools.cache
@@ -37,7 +38,9 @@ def at(tree, *index):
     return jax.tree.map(lambda x: x[index], tree)
 
 
-@pytest.mark.parametrize("name", CASES)
+# Outside of jit each operation of an unrolled search is compiled by itself; those with
+# a loop are the same functions.
+@pytest.mark.parametrize("name", [x for x in CASES if x not in UNROLLED])
 def test_jit_equals_eager(name):
     case = case_of(name)
     toys.assert_trees_close(case.fn(*case.variant(1)), expected(name, 1), **CLOSE)
