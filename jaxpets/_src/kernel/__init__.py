@@ -22,7 +22,7 @@ Who includes whom:
     gpu_rollout.cu      gpu_layout.h, handler.h, wgmma.h
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
-    handler.h           rollout.h and XLA's headers: the operands as XLA hands them over
+    handler.h           rollout.h and XLA's c_api.h: the operands as XLA hands them over
     rollout.h           sizes.h: the operands, and how far apart their numbers lie
     *_layout.h          sizes.h: where each weight lies, and their type
     sizes.h             model.h, and that particle.h: functions of one particle
