@@ -1,6 +1,7 @@
 """Where there can be no rollout kernel the scan runs, and the result says why."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -11,8 +12,9 @@ import rollouts
 from rollouts import SMALL, recorded
 
 import jaxpets
-from jaxpets import Precision
+from jaxpets import Precision, coordinates
 from jaxpets._src.kernel.build import Kind
+from jaxpets.coordinates import Coordinate
 
 
 def assert_is_the_scan(fused, case, words, precision=Precision.BF16):
@@ -29,10 +31,15 @@ def assert_is_the_scan(fused, case, words, precision=Precision.BF16):
 
 
 def test_a_warning_says_why():
-    space = jaxpets.delta_space()._replace(features=jnp.sort)
-    case = dataclasses.replace(SMALL, space=space)
+    """What, of which entries by their names, and in which line."""
+    space = coordinates.space(map(Coordinate, ("height", "pitch", "rate")))
+    features = lambda obs: jnp.concatenate([obs, jax.lax.erf(obs[..., 1:])], -1)  # noqa: E731
+    case = dataclasses.replace(SMALL, space=space._replace(features=features))
     fused, (warning,) = recorded(case.fused)
-    words = "the primitive 'sort' has no C++ form"
+    place = f"{Path(__file__).name}:{features.__code__.co_firstlineno}"
+    words = (
+        f"the primitive 'erf' has no C++ form, in features of pitch and rate ({place})"
+    )
     assert str(warning.message) == f"fused_rollout runs as a scan: {words}."
     assert warning.filename == rollouts.__file__  # where it was asked for
     assert_is_the_scan(fused, case, words)
@@ -74,34 +81,6 @@ def test_other_precisions_are_the_scan_on_a_gpu(precision):
 def test_what_is_too_large_is_the_scan_on_a_gpu(change, words):
     case = dataclasses.replace(SMALL, **change)
     assert_is_the_scan(case.of_kind(Kind.GPU_REFERENCE), case, words)
-
-
-@pytest.mark.parametrize(
-    ("function", "words"),
-    [
-        (jnp.sort, "the primitive 'sort' has no C++ form"),
-        (jnp.cumsum, "the primitive 'cumsum' has no C++ form"),
-        (
-            lambda obs: obs + obs[..., jnp.int32(0)] * jnp.floor(obs).astype(jnp.int32),
-            "values of type int32 have no C++ form",
-        ),
-        (
-            lambda obs: (
-                jnp.take(obs, (obs[..., 0] > 0).astype(jnp.int32), axis=-1) + obs
-            ),
-            "values of type int32 have no C++ form",
-        ),
-    ],
-)
-def test_what_has_no_cpp_is_the_scan(engine, function, words):
-    def features(obs):
-        return function(obs).astype(jnp.float32)
-
-    with jax.numpy_dtype_promotion("standard"):
-        space = jaxpets.delta_space()._replace(features=features)
-        case = dataclasses.replace(SMALL, space=space)
-        fused = case.of_kind(engine.kind)
-    assert fused.reason == words and not fused.uses_kernel
 
 
 NEVER = dataclasses.replace(SMALL, hidden_sizes=(40,))  # never built

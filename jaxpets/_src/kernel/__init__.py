@@ -6,7 +6,7 @@ reference in plain C++, for tests on machines without one.
 
 The code. What depends on the model is generated into model.h, all else is fixed:
 
-    ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function
+    ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function, primitives
     sizes -> constants                       {gpu,cpu}_layout.header
     widths -> tensor core instructions       gpu_layout.products
     model.h and sources -> .so -> FFI target    build.load_kernel
