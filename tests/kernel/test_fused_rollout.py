@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -206,6 +207,21 @@ def test_a_model_that_is_not_of_jaxpets_is_refused():
     text = "model must be an Ensemble, got EnsembleConfig"
     with pytest.raises(TypeError, match=text):
         jaxpets.fused_rollout(SMALL.config(), num_particles=6)
+
+
+def test_operands_of_another_model_are_refused():
+    """What Python has checked is checked again where memory is read."""
+    program = str(jax.make_jaxpr(REFERENCE.fused(SMALL))(*SMALL.avals()))
+    (target,) = re.findall("jaxpets_rollout_gpu_reference_[0-9a-f]+", program)
+    path = jax.eval_shape(SMALL.scan(), *SMALL.avals())
+    operands = [jnp.zeros((3, 1))] * 5
+    for count, words in (
+        (5, "those of another model"),
+        (4, "there are other operands"),
+    ):
+        call = jax.ffi.ffi_call(target, path)
+        with pytest.raises(jax.errors.JaxRuntimeError, match=words):
+            jax.block_until_ready(call(*operands[:count]))
 
 
 def test_it_has_no_gradient():

@@ -1,8 +1,8 @@
 // The rollout as an XLA custom call. Included after the layout of the weights.
 //
-// A call comes as a frame of C structs. XLA also has C++ for them, which takes longer to
-// compile than a whole kernel. What is used here has the same names in every version of
-// the structs that jaxlib 0.10 and 0.11 come with; zero is right for all else in them.
+// A call comes as a frame of C structs. XLA also has C++ for them, which alone takes two
+// seconds to compile. What is used here has the same names in jaxlib 0.10 and 0.11; zero
+// is right for whatever else the structs have.
 #pragma once
 
 #include "rollout.h"
