@@ -65,10 +65,10 @@ def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
     says why in `reason`, `uses_kernel` is False, and a warning of one line is given:
 
     - the model's space does more than arithmetic on single entries, moving them and
-      summing, or makes next observations of another size;
+      summing (the reason names the entries and the line of the code), or makes next
+      observations of another size;
     - there is no compiler (nvcc; c++, g++ or clang++): the kernel is built for the
-      model here, in half a minute on a GPU and in seconds on a CPU, and kept in the
-      user's cache folder;
+      model here, in seconds, and kept in the user's cache folder;
     - keys are not of JAX's default kind, partitionable threefry (only a call can know:
       it warns);
     - the device is neither a CPU nor a GPU of compute capability 9.0 (H100, H200,
@@ -187,10 +187,15 @@ def _model_header(
     for name in ("next_obs", "bound"):
         function, arguments = functions[name]
         _check_result(name, function, len(arguments), layout.obs_size)
-    code = [
-        cpp_function(name, function, [(row, layout.obs_size) for row in arguments])
-        for name, (function, arguments) in functions.items()
-    ]
+    code: list[str] = []
+    for name, (function, arguments) in functions.items():
+        rows = [(row, layout.obs_size) for row in arguments]
+        called = {
+            f"{row}[{i}]": entry.name
+            for row in arguments
+            for i, entry in enumerate(space.coordinates)
+        }
+        code.append(cpp_function(name, function, rows, called))
     header = ['#pragma once\n#include "particle.h"', layout.header(), *code]
     if kind is Kind.GPU and isinstance(layout, GpuLayout):
         header.append(layout.products())

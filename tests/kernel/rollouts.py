@@ -8,14 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import robots
 
 import jaxpets
 from jaxpets import Precision, coordinates
 from jaxpets._src.fused_rollout import rollout_of_kind
 from jaxpets._src.kernel import build
 from jaxpets._src.kernel.build import Kind
-from jaxpets.coordinates import Coordinate
 from jaxpets.envs import half_cheetah as hc
+from jaxpets.envs.observations import readings
 
 _real = build._compiler
 
@@ -57,15 +58,12 @@ RICH = jaxpets.ModelSpace(
     next_obs=lambda obs, target: WEIGHT * obs + target * 0.5,
     bound=lambda obs, low, high: jnp.where(WEIGHT > 0.7, jnp.clip(obs, low, high), obs),
 )
-# One of each kind of coordinate that a robot may have.
-ROBOT = coordinates.space([
-    Coordinate("speed", "absolute", is_input=False),
-    *(Coordinate(f"q{x}", "quaternion", is_bounded=False) for x in "wxyz"),
-    Coordinate("pole", "angle", is_bounded=False),
-    Coordinate("rate"),
-])  # fmt: skip
-# The noise alone: nothing is kept from step to step.
-FORGETFUL = jaxpets.delta_space()._replace(next_obs=lambda obs, target: target)
+
+
+def _observed(*names):
+    """The space of what is observed of a body that is free, has joints and sensors."""
+    model = robots.compiled(robots.FREE, robots.SENSORS + robots.HIP)
+    return coordinates.space([row.coordinate for row in readings(model, names)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,17 +146,39 @@ SMALL = Case()
 CHEETAH = Case(18, 6, (40, 36, 64), num_members=5, particles=4, space=hc.model_space())
 CASES = {
     "small": SMALL,
-    "one hidden layer": Case(obs_size=1, action_size=1, hidden_sizes=(20,)),
-    "without a margin": Case(obs_size=5, hidden_sizes=(33, 16), state_margin=None),
-    "one member": dataclasses.replace(SMALL, num_members=1, particles=7),
-    "one particle of each": dataclasses.replace(SMALL, particles=1, horizon=1),
-    "one candidate": dataclasses.replace(SMALL, num_samples=1),
-    "obs 7": Case(obs_size=7, action_size=1, hidden_sizes=(16, 16, 16)),
-    "obs 16": Case(obs_size=16, action_size=3, hidden_sizes=(64,)),
-    "half_cheetah": CHEETAH,
+    "least": Case(obs_size=1, action_size=1, hidden_sizes=(1,)),
+    "one of all": dataclasses.replace(
+        SMALL, num_members=1, particles=1, num_samples=1, horizon=1
+    ),
+    # One for each kind of space, and each with another width of the head.
+    "half_cheetah": CHEETAH,  # planar: slides and hinges
+    "free joint": Case(  # without a bound
+        obs_size=13,
+        hidden_sizes=(33, 16),
+        state_margin=None,
+        space=_observed("qpos/root", "qvel/root"),
+    ),
+    "ball joint": Case(
+        obs_size=7,
+        action_size=1,
+        hidden_sizes=(16, 16, 16),
+        space=_observed("qpos/shoulder", "qvel/shoulder"),
+    ),
+    "sensors": Case(  # of all kinds, and where sites are
+        obs_size=16,
+        action_size=3,
+        hidden_sizes=(64,),
+        space=_observed("sensordata", "site_xpos", "qvel/hip"),
+    ),
     "rich": Case(obs_size=4, space=RICH),
-    "robot": Case(obs_size=7, space=ROBOT),
 }
+
+
+def unbounded(params):
+    """Parameters before there are data: the range of what is imagined is infinite."""
+    scaler = params.scaler
+    free = scaler._replace(low=scaler.low - jnp.inf, high=scaler.high + jnp.inf)
+    return params._replace(scaler=free)
 
 
 def relative_error(got, want):

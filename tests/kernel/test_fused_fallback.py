@@ -1,6 +1,7 @@
 """Where there can be no rollout kernel the scan runs, and the result says why."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -8,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rollouts
-from rollouts import SMALL, recorded
+from rollouts import REFERENCE, SMALL, recorded
 
 import jaxpets
-from jaxpets import Precision
+from jaxpets import Precision, coordinates
 from jaxpets._src.kernel.build import Kind
+from jaxpets.coordinates import Coordinate
 
 
 def assert_is_the_scan(fused, case, words, precision=Precision.BF16):
@@ -29,10 +31,15 @@ def assert_is_the_scan(fused, case, words, precision=Precision.BF16):
 
 
 def test_a_warning_says_why():
-    space = jaxpets.delta_space()._replace(features=jnp.sort)
-    case = dataclasses.replace(SMALL, space=space)
+    """What, of which entries by their names, and in which line."""
+    space = coordinates.space(map(Coordinate, ("height", "pitch", "rate")))
+    features = lambda obs: jnp.concatenate([obs, jax.lax.erf(obs[..., 1:])], -1)  # noqa: E731
+    case = dataclasses.replace(SMALL, space=space._replace(features=features))
     fused, (warning,) = recorded(case.fused)
-    words = "the primitive 'sort' has no C++ form"
+    place = f"{Path(__file__).name}:{features.__code__.co_firstlineno}"
+    words = (
+        f"the primitive 'erf' has no C++ form, in features of pitch and rate ({place})"
+    )
     assert str(warning.message) == f"fused_rollout runs as a scan: {words}."
     assert warning.filename == rollouts.__file__  # where it was asked for
     assert_is_the_scan(fused, case, words)
@@ -76,34 +83,6 @@ def test_what_is_too_large_is_the_scan_on_a_gpu(change, words):
     assert_is_the_scan(case.of_kind(Kind.GPU_REFERENCE), case, words)
 
 
-@pytest.mark.parametrize(
-    ("function", "words"),
-    [
-        (jnp.sort, "the primitive 'sort' has no C++ form"),
-        (jnp.cumsum, "the primitive 'cumsum' has no C++ form"),
-        (
-            lambda obs: obs + obs[..., jnp.int32(0)] * jnp.floor(obs).astype(jnp.int32),
-            "values of type int32 have no C++ form",
-        ),
-        (
-            lambda obs: (
-                jnp.take(obs, (obs[..., 0] > 0).astype(jnp.int32), axis=-1) + obs
-            ),
-            "values of type int32 have no C++ form",
-        ),
-    ],
-)
-def test_what_has_no_cpp_is_the_scan(engine, function, words):
-    def features(obs):
-        return function(obs).astype(jnp.float32)
-
-    with jax.numpy_dtype_promotion("standard"):
-        space = jaxpets.delta_space()._replace(features=features)
-        case = dataclasses.replace(SMALL, space=space)
-        fused = case.of_kind(engine.kind)
-    assert fused.reason == words and not fused.uses_kernel
-
-
 NEVER = dataclasses.replace(SMALL, hidden_sizes=(40,))  # never built
 
 
@@ -129,7 +108,7 @@ def test_coordinates_that_do_not_fit_are_refused_as_the_scan_refuses_them(engine
 
 
 @pytest.mark.parametrize("size", [1, 4])
-def test_coordinates_that_only_a_bound_makes_fit_are_the_scan(engine, size):
+def test_coordinates_that_only_a_bound_makes_fit_are_the_scan(size):
     """A next observation of another size: a kernel has no room for it."""
 
     def next_obs(obs, target):
@@ -140,20 +119,20 @@ def test_coordinates_that_only_a_bound_makes_fit_are_the_scan(engine, size):
         bound=lambda obs, low, high: jnp.clip(obs[..., -3:], low, high),
     )
     case = dataclasses.replace(SMALL, space=space)
-    fused = case.of_kind(engine.kind)
-    got = jax.jit(fused)(*case.args())
-    want = jax.jit(case.scan(Precision.BF16))(*case.args())
-    np.testing.assert_array_equal(got, want)
+    fused = case.of_kind(Kind.GPU_REFERENCE)
+    assert_is_the_scan(fused, case, f"next_obs makes [{size}] of [3]")
 
 
-def test_other_kinds_of_keys_run_the_scan(engine):
-    params, _, obs, actions = SMALL.args()
+def test_other_kinds_of_keys_run_the_scan():
+    """Of a kernel that was built."""
+    fused = REFERENCE.fused(SMALL)
     text = "fused_rollout runs as a scan: keys are not partitionable threefry."
+    params, key, obs, actions = SMALL.args()
     args = params, jax.random.key(0, impl="rbg"), obs, actions
-    got, (warning,) = recorded(lambda: jax.jit(engine.fused(SMALL))(*args))
+    got, (warning,) = recorded(lambda: jax.jit(fused)(*args))
     assert str(warning.message) == text
     np.testing.assert_array_equal(got, jax.jit(SMALL.scan(Precision.BF16))(*args))
     with jax.threefry_partitionable(False):
-        args = params, jax.random.key(0), obs, actions
-        _, (warning,) = recorded(lambda: jax.eval_shape(engine.fused(SMALL), *args))
+        args = params, key, obs, actions
+        _, (warning,) = recorded(lambda: jax.eval_shape(fused, *args))
         assert str(warning.message) == text

@@ -51,7 +51,9 @@ def test_on_a_hopper_gpu_the_kernel_is_built(monkeypatch):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", ["half_cheetah", "obs 7", "rich"])
+@pytest.mark.parametrize(
+    "name", ["half_cheetah", "free joint", "ball joint", "sensors", "rich"]
+)
 def test_the_kernel_equals_the_scan(name):
     case = dataclasses.replace(CASES[name], num_samples=70)  # blocks that are not full
     with jax.default_device(jax.devices("gpu")[0]):

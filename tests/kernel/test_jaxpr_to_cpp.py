@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxpets._src.kernel import jaxpr_to_cpp
+from jaxpets._src.kernel import jaxpr_to_cpp, primitives
 from jaxpets._src.kernel.jaxpr_to_cpp import UnsupportedError, cpp_function
 
 NAN, INF = np.nan, np.inf
@@ -43,7 +43,7 @@ def with_own_gradient(x):
 
 with_own_gradient.defvjp(lambda x: (x * 2.0, None), lambda _, g: (g,))
 
-# Names of primitives, each written as `_ELEMENTWISE` has it.
+# Names of primitives, each written as `primitives.ELEMENTWISE` has it.
 ELEMENTWISE = {
     "abs": lambda x, y: abs(x),
     "add": lambda x, y: x + y,
@@ -194,7 +194,7 @@ def library(tmp_path_factory):
 
 
 def test_every_expression_is_tested():
-    assert set(ELEMENTWISE) == set(jaxpr_to_cpp._ELEMENTWISE)
+    assert set(ELEMENTWISE) == set(primitives.ELEMENTWISE)
 
 
 @pytest.mark.parametrize("name", ELEMENTWISE)
@@ -294,4 +294,36 @@ def test_strict_promotion_and_tracing_around_it():
 def test_what_has_no_form_says_so(function, words):
     with pytest.raises(UnsupportedError) as error:
         cpp_function("f", function, SIZES)
-    assert str(error.value) == words
+    assert str(error.value).startswith(f"{words}, in f of ")
+
+
+def said(function, called=None, sizes=SIZES):
+    """What is said of a function that has no form, after what it does."""
+    with pytest.raises(UnsupportedError) as error:
+        cpp_function("f", function, sizes, called)
+    return str(error.value).partition(" form, ")[2]
+
+
+def test_what_has_no_form_is_said_to_be_of_its_entries():
+    """Of those that it is computed from, in the order of the arguments."""
+    assert said(lambda x, y: jnp.sort(x)[:0]).startswith(
+        "in f of x[0], x[1], x[2] and 1 more ("
+    )
+    mixed = lambda x, y: jnp.concatenate([x, lax.erf(jnp.sin(y[3:] * x[1:2] + y[3:]))])  # noqa: E731
+    assert said(mixed).startswith("in f of x[1] and y[3] (")
+    called = {"x[1]": "qpos/hip", "y[3]": "qvel/hip"}
+    assert said(mixed, called).startswith("in f of qpos/hip and qvel/hip (")
+    same = {"x[1]": "hip", "y[3]": "hip"}  # one entry, and what moves it
+    assert said(mixed, same).startswith("in f of hip (")
+    nothing = lambda x, y: lax.erf(jnp.sum(x[4:], keepdims=True))  # noqa: E731
+    assert said(nothing).startswith("in f (")
+
+
+def test_what_has_no_form_is_said_to_be_in_its_line():
+    """Where the model asks for it, not where a function that it calls does."""
+    inner = jax.jit(lambda x: jnp.sort(x * 2.0))
+    function = lambda x, y: x + inner(y)  # noqa: E731
+    file, line = Path(__file__).name, function.__code__.co_firstlineno
+    assert said(function).endswith(f"and 1 more ({file}:{line})")
+    # The function is not the model's own.
+    assert said(jnp.sort, sizes=SIZES[:1]) == "in f of x[0], x[1], x[2] and 1 more"

@@ -116,21 +116,28 @@ def test_roots_and_inverses(call):
     assert np.isnan(call("fast_sqrt", np.float32([-1.0, np.nan]))).all()
 
 
-def test_every_number_that_a_draw_can_have(call):
-    """Of the 32 bits 23 count: all 8 million, the ends and the middle among them."""
-    bits = np.arange(2**23, dtype=np.uint32) << 9
-    got = call("normal", bits)
+# Of the 32 bits 23 count: all 8 million, the ends and the middle among them.
+BITS = np.arange(2**23, dtype=np.uint32) << 9
+
+
+@pytest.fixture(scope="module")
+def draws():
+    """What jax.random.normal makes of BITS."""
 
     @jax.jit
-    def drawn(bits):  # as jax.random.normal
+    def drawn(bits):
         fraction = jax.lax.bitcast_convert_type(bits >> 9 | 0x3F800000, jnp.float32)
         least = jnp.nextafter(jnp.float32(-1), jnp.float32(0))
         uniform = jnp.maximum(least, (fraction - 1.0) * (1.0 - least) + least)
         return np.sqrt(np.float32(2)) * jax.lax.erf_inv(uniform)
 
+    return np.asarray(drawn(BITS))
+
+
+def test_every_number_that_a_draw_can_have(call, draws):
+    got = call("normal", BITS)
     assert got.min() < -5 and got.max() > 5 and np.isfinite(got).all()
-    want = np.asarray(drawn(bits))
-    near = abs(want) < 2.9
-    np.testing.assert_allclose(got[near], want[near], rtol=2e-6, atol=1e-7)
+    near = abs(draws) < 2.9
+    np.testing.assert_allclose(got[near], draws[near], rtol=2e-6, atol=1e-7)
     # JAX rounds u^2: of 1 - u^2, and so of the logarithm, a tail has lost digits.
-    np.testing.assert_allclose(got, want, rtol=1e-5)
+    np.testing.assert_allclose(got, draws, rtol=1e-5)

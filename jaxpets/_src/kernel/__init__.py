@@ -6,7 +6,7 @@ reference in plain C++, for tests on machines without one.
 
 The code. What depends on the model is generated into model.h, all else is fixed:
 
-    ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function
+    ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function, primitives
     sizes -> constants                       {gpu,cpu}_layout.header
     widths -> tensor core instructions       gpu_layout.products
     model.h and sources -> .so -> FFI target    build.load_kernel
@@ -22,7 +22,7 @@ Who includes whom:
     gpu_rollout.cu      gpu_layout.h, handler.h, wgmma.h
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
-    handler.h           rollout.h and XLA's headers: the operands as XLA hands them over
+    handler.h           rollout.h and XLA's c_api.h: the operands as XLA hands them over
     rollout.h           sizes.h: the operands, and how far apart their numbers lie
     *_layout.h          sizes.h: where each weight lies, and their type
     sizes.h             model.h, and that particle.h: functions of one particle

@@ -21,7 +21,7 @@ import jax
 from jaxpets._src.kernel import cache
 
 _SYMBOL = "jaxpets_rollout"
-# Seconds until a compiler is ended. A kernel takes five, and half a minute on a GPU.
+# Seconds until a compiler is ended. A kernel takes three, and ten on a GPU.
 _LIMIT, _GPU_LIMIT = 120.0, 300.0
 
 

@@ -206,26 +206,56 @@ class Blocks {
   int64_t done_ = 0;
 };
 
-ffi::Error run(ffi::ThreadPool pool, ffi::AnyBuffer weights, ffi::AnyBuffer shared,
-               ffi::AnyBuffer keys, ffi::AnyBuffer obs, ffi::AnyBuffer actions,
-               ffi::Result<ffi::AnyBuffer> path) {
-  const Problem problem = read(weights, shared, keys, obs, actions, *path);
-  if (!problem.error.empty()) return ffi::Error::InvalidArgument(problem.error);
+// Whether XLA did as it was asked to; its error, if not, is ours to end.
+bool succeeds(const Call& call, XLA_FFI_Error* error) {
+  if (!error) return true;
+  XLA_FFI_Error_Destroy_Args args = {};
+  args.struct_size = XLA_FFI_Error_Destroy_Args_STRUCT_SIZE;
+  args.error = error;
+  call.api->XLA_FFI_Error_Destroy(&args);
+  return false;
+}
+
+// How many threads XLA has; none if it does not say.
+int64_t num_threads(const Call& call) {
+  int64_t count = 0;
+  XLA_FFI_ThreadPool_NumThreads_Args args = {};
+  args.struct_size = XLA_FFI_ThreadPool_NumThreads_Args_STRUCT_SIZE;
+  args.ctx = call.ctx;
+  args.num_threads = &count;
+  return succeeds(call, call.api->XLA_FFI_ThreadPool_NumThreads(&args)) ? count : 0;
+}
+
+// Lets one of XLA's threads help, if there is one.
+void help(const Call& call, const std::shared_ptr<Blocks>& blocks) {
+  using Shared = std::shared_ptr<Blocks>;
+  auto own = std::make_unique<Shared>(blocks);
+  XLA_FFI_ThreadPool_Schedule_Args args = {};
+  args.struct_size = XLA_FFI_ThreadPool_Schedule_Args_STRUCT_SIZE;
+  args.ctx = call.ctx;
+  args.data = own.get();
+  args.task = [](void* data) {
+    const std::unique_ptr<Shared> blocks(static_cast<Shared*>(data));
+    const std::unique_ptr<Scratch> scratch(new (std::nothrow) Scratch);
+    if (scratch) (*blocks)->work(*scratch);
+  };
+  if (succeeds(call, call.api->XLA_FFI_ThreadPool_Schedule(&args))) own.release();
+}
+
+XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {
   const std::unique_ptr<Scratch> own(new (std::nothrow) Scratch);
-  if (!own) return ffi::Error(ffi::ErrorCode::kResourceExhausted, "out of memory");
+  if (!own) return failure(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, "out of memory");
   // A helper that starts when all is done finds nothing to do, but must find the blocks.
-  const auto blocks = std::make_shared<Blocks>(problem.rollout);
-  for (int64_t i = 1; i < pool.num_threads() && i < blocks->count(); ++i)
-    pool.Schedule([blocks] {
-      const std::unique_ptr<Scratch> scratch(new (std::nothrow) Scratch);
-      if (scratch) blocks->work(*scratch);
-    });
+  const auto blocks = std::make_shared<Blocks>(rollout);
+  const int64_t threads = num_threads(call);
+  for (int64_t i = 1; i < threads && i < blocks->count(); ++i) help(call, blocks);
   blocks->work(*own);
   blocks->wait();
-  return ffi::Error::Success();
+  return nullptr;
 }
 
 }  // namespace
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
-                              with_operands(ffi::Ffi::Bind().Ctx<ffi::ThreadPool>()));
+extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
+  return handle(*call, 0, run);
+}

@@ -82,21 +82,18 @@ void run_particle(const Rollout& rollout, int member, int particle) {
   }
 }
 
-ffi::Error run(ffi::AnyBuffer weights, ffi::AnyBuffer shared, ffi::AnyBuffer keys,
-               ffi::AnyBuffer obs, ffi::AnyBuffer actions,
-               ffi::Result<ffi::AnyBuffer> path) {
-  const Problem problem = read(weights, shared, keys, obs, actions, *path);
-  if (!problem.error.empty()) return ffi::Error::InvalidArgument(problem.error);
-  for (int64_t batch = 0; batch < problem.rollout.batch; ++batch) {
-    const Rollout rollout = at_batch(problem.rollout, batch);
+XLA_FFI_Error* run(const Call&, const Rollout& whole) {
+  for (int64_t batch = 0; batch < whole.batch; ++batch) {
+    const Rollout rollout = at_batch(whole, batch);
     for (int member = 0; member < rollout.num_members; ++member)
       for (int row = 0; row < rollout.num_candidates * rollout.particles; ++row)
         run_particle(rollout, member, row);
   }
-  return ffi::Error::Success();
+  return nullptr;
 }
 
 }  // namespace
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(jaxpets_rollout, run,
-                              with_operands(ffi::Ffi::Bind()));
+extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
+  return handle(*call, 0, run);
+}

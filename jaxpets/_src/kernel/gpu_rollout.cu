@@ -599,14 +599,14 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
   }
 }
 
-ffi::Error run(cudaStream_t stream, ffi::AnyBuffer weights,
-               ffi::AnyBuffer shared, ffi::AnyBuffer keys, ffi::AnyBuffer obs,
-               ffi::AnyBuffer actions, ffi::Result<ffi::AnyBuffer> path) {
-  const Problem problem = read(weights, shared, keys, obs, actions, *path);
-  if (!problem.error.empty()) return ffi::Error::InvalidArgument(problem.error);
-  const Rollout& rollout = problem.rollout;
+XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {
   constexpr size_t size = sizeof(Shared);
   static_assert(size <= 232448, "a block's shared memory is too small for this model");
+  XLA_FFI_Stream_Get_Args args = {};
+  args.struct_size = XLA_FFI_Stream_Get_Args_STRUCT_SIZE;
+  args.ctx = call.ctx;
+  if (XLA_FFI_Error* none = call.api->XLA_FFI_Stream_Get(&args)) return none;
+  const auto stream = static_cast<cudaStream_t>(args.stream);
   int device = 0, multiprocessors = 1;
   cudaError_t error = cudaGetDevice(&device);
   if (error == cudaSuccess)
@@ -621,14 +621,13 @@ ffi::Error run(cudaStream_t stream, ffi::AnyBuffer weights,
                                                                               split);
     error = cudaGetLastError();
   }
-  return error == cudaSuccess ? ffi::Error::Success()
-                              : ffi::Error::Internal(cudaGetErrorString(error));
+  if (error == cudaSuccess) return nullptr;
+  return failure(call, XLA_FFI_Error_Code_INTERNAL, cudaGetErrorString(error));
 }
 
 }  // namespace
 
 // The stream is only launched on, so XLA may record the call in a CUDA graph.
-XLA_FFI_DEFINE_HANDLER_SYMBOL(
-    jaxpets_rollout, run,
-    with_operands(ffi::Ffi::Bind().Ctx<ffi::PlatformStream<cudaStream_t>>()),
-    {ffi::Traits::kCmdBufferCompatible});
+extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
+  return handle(*call, XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE, run);
+}

@@ -8,87 +8,31 @@ where.
 """
 
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
+from jax.extend import core, source_info_util
 
-# One C++ expression per element; {0}, {1}, ... are the operands.
-_ELEMENTWISE = {
-    "abs": "fabsf({0})",
-    "add": "({0} + {1})",
-    "and": "({0} && {1})",
-    "atan2": "atan2f({0}, {1})",
-    "ceil": "ceilf({0})",
-    "clamp": "lower(higher({1}, {0}), {2})",
-    "copy": "{0}",
-    "cos": "cosine({0})",
-    "div": "({0} / {1})",
-    "eq": "({0} == {1})",
-    "exp": "fast_exp({0})",
-    "floor": "floorf({0})",
-    "ge": "({0} >= {1})",
-    "gt": "({0} > {1})",
-    "is_finite": "(fabsf({0}) <= 3.402823466e38f)",
-    "le": "({0} <= {1})",
-    "log": "logf({0})",
-    "log1p": "log1pf({0})",
-    "logistic": "fast_inverse(1.0f + fast_exp(-{0}))",
-    "lt": "({0} < {1})",
-    "max": "higher({0}, {1})",
-    "min": "lower({0}, {1})",
-    "mul": "({0} * {1})",
-    "ne": "({0} != {1})",
-    "neg": "(-{0})",
-    "not": "(!{0})",
-    "or": "({0} || {1})",
-    "pow": "powf({0}, {1})",
-    "rsqrt": "(1.0f / sqrtf({0}))",
-    "select_n": "({0} ? {2} : {1})",
-    "sin": "sine({0})",
-    "sqrt": "sqrtf({0})",
-    "square": "({0} * {0})",
-    "stop_gradient": "{0}",
-    "sub": "({0} - {1})",
-    "tan": "tanf({0})",
-    "tanh": "tanhf({0})",
-}
-# What to do with two elements, and what is left without any.
-_REDUCTIONS = {
-    "reduce_sum": ("add", 0.0),
-    "reduce_max": ("max", -math.inf),
-    "reduce_min": ("min", math.inf),
-}
-# They only move elements: what they do to numbers, they do to names.
-_MOVES = {
-    "broadcast_in_dim",
-    "concatenate",
-    "dynamic_slice",
-    "expand_dims",
-    "gather",
-    "pad",
-    "reshape",
-    "rev",
-    "slice",
-    "split",
-    "squeeze",
-    "stack",
-    "tile",
-    "transpose",
-    "unstack",
-}
-_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+from jaxpets._src.kernel.primitives import CALLS, ELEMENTWISE, MOVES, REDUCTIONS
+
+_NAME = re.compile(r"\bv\d+\b|\w+\[\d+\]")  # of a variable, of an argument's entry
+_MOST_SAID = 3  # entries in a message
 
 
 class UnsupportedError(Exception):
-    """A primitive that has no C++ here."""
+    """No kernel: a model does what has no C++ here. The message is one line."""
 
 
 def cpp_function(
-    name: str, function: Callable[..., Any], sizes: Sequence[tuple[str, int]]
+    name: str,
+    function: Callable[..., Any],
+    sizes: Sequence[tuple[str, int]],
+    called: Mapping[str, str] | None = None,
 ) -> str:
     """Returns C++ for a function of float32 vectors that returns one vector.
 
@@ -97,10 +41,12 @@ def cpp_function(
         which must be none of them: it is written before all of them are read.
       function: JAX code, traceable.
       sizes: name and length of each argument.
+      called: what a message is to call entries of the arguments: `{"obs[0]": "speed"}`.
 
     Raises:
       UnsupportedError: if the function does what has no C++ here: anything but
-        arithmetic on elements, moving them, and sums over them.
+        arithmetic on elements, moving them, and sums over them. It names what, the
+        entries that it is done to, and the line of the code that does it.
     """
     shapes = [jax.ShapeDtypeStruct((size,), jnp.float32) for _, size in sizes]
     closed = jax.make_jaxpr(function)(*shapes)
@@ -109,7 +55,13 @@ def cpp_function(
         np.array([f"{argument}[{i}]" for i in range(size)], dtype=object)
         for argument, size in sizes
     ]
-    (result,) = writer.run(closed.jaxpr, closed.consts, names)
+    try:
+        (result,) = writer.run(closed.jaxpr, closed.consts, names)
+    except UnsupportedError as error:
+        outer, inputs = writer.calls[0][0], writer.calls[-1][1]
+        entries = [(called or {}).get(x, x) for x in writer.entries(inputs, names)]
+        where = f"in {name}{_listed(entries)}{_place(outer)}"
+        raise UnsupportedError(f"{error}, {where}") from None
     stores = [
         f"out[{i}] = {_text(value)};" for i, value in enumerate(result.reshape(-1))
     ]
@@ -128,6 +80,8 @@ class _Writer:
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        # Equations that are being written, with their inputs, from outside.
+        self.calls: list[tuple[Any, list[np.ndarray]]] = []
 
     def run(
         self, jaxpr: Any, consts: Sequence[Any], args: Sequence[np.ndarray]
@@ -142,18 +96,31 @@ class _Writer:
         known |= dict(zip(jaxpr.invars, args, strict=True))
         for eqn in jaxpr.eqns:
             inputs = [read(atom) for atom in eqn.invars]
+            self.calls.append((eqn, inputs))
             results = self._equation(eqn, inputs)
+            self.calls.pop()
             known |= dict(zip(eqn.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
+    def entries(
+        self, values: Sequence[np.ndarray], args: Sequence[np.ndarray]
+    ) -> list[str]:
+        """Returns the names among `args` of what values were computed from."""
+        found = {x for array in values for x in array.reshape(-1).tolist()}
+        for line in reversed(self.lines):
+            name, *read = _NAME.findall(line)
+            if name in found:
+                found.update(read)
+        return [name for names in args for name in names if name in found]
+
     def _equation(self, eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
         name = eqn.primitive.name
-        if name in _CALLS:
+        if name in CALLS:
             inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
             return self.run(inner.jaxpr, inner.consts, inputs)
         if all(array.dtype != object for array in inputs):
             return _bind(eqn, inputs)
-        if name in _MOVES:
+        if name in MOVES:
             return _move(eqn, inputs)
         return [self._compute(eqn, inputs)]
 
@@ -163,11 +130,11 @@ class _Writer:
             return self._convert(eqn, inputs[0])
         if name == "integer_pow":
             return self._power(inputs[0], eqn.params["y"])
-        if name in _REDUCTIONS:
+        if name in REDUCTIONS:
             return self._reduce(eqn, inputs[0])
         if name == "select_n" and len(inputs) > 3:
             raise UnsupportedError("a choice among more than two has no C++ form")
-        if name in _ELEMENTWISE:
+        if name in ELEMENTWISE:
             return self._elementwise(name, eqn.outvars[0].aval, inputs)
         raise UnsupportedError(f"the primitive {name!r} has no C++ form")
 
@@ -184,7 +151,7 @@ class _Writer:
         operands = [np.broadcast_to(array, aval.shape) for array in inputs]
         for index in np.ndindex(aval.shape):
             texts = [_text(operand[index]) for operand in operands]
-            result[index] = self._assign(kind, _ELEMENTWISE[name].format(*texts))
+            result[index] = self._assign(kind, ELEMENTWISE[name].format(*texts))
         return result
 
     def _convert(self, eqn: Any, array: np.ndarray) -> np.ndarray:
@@ -210,8 +177,8 @@ class _Writer:
         count = math.prod(array.shape[axis] for axis in axes)
         result = np.empty(eqn.outvars[0].aval.shape, dtype=object)
         moved = array.transpose(*kept, *axes).reshape(*result.shape, count)
-        name, of_nothing = _REDUCTIONS[eqn.primitive.name]
-        expression = _ELEMENTWISE[name]
+        name, of_nothing = REDUCTIONS[eqn.primitive.name]
+        expression = ELEMENTWISE[name]
         for index in np.ndindex(result.shape):
             total, *rest = map(_text, moved[index] if count else [of_nothing])
             for text in rest:
@@ -253,6 +220,25 @@ def _move(eqn: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
         values[np.asarray(result).reshape(-1)].reshape(result.shape)
         for result in results
     ]
+
+
+def _place(eqn: Any) -> str:
+    """Returns where an equation stands in the code, unless that is here."""
+    found = re.match(r"(.+?):(\d+)", source_info_util.summarize(eqn.source_info))
+    if not found or found[1] == __file__:
+        return ""
+    return f" ({Path(found[1]).name}:{found[2]})"
+
+
+def _listed(entries: Sequence[str]) -> str:
+    """Returns the first of a message's entries, and how many more there are."""
+    if not entries:
+        return ""
+    names = list(dict.fromkeys(entries))
+    if len(names) > _MOST_SAID:
+        names[_MOST_SAID:] = [f"{len(names) - _MOST_SAID} more"]
+    *first, last = names
+    return f" of {', '.join(first)}{' and ' if first else ''}{last}"
 
 
 def _kind(dtype: Any) -> str:
