@@ -42,16 +42,28 @@ class Trials(NamedTuple):
     constants: Any = ()  # [...], as in an EnvState
 
 
+class Score(NamedTuple):
+    """What trials were worth until they ended, which is where physics diverged, if so.
+
+    returns: `[..., K]`.
+    turns: `[...]`, or None for a robot of which none are counted.
+    num_steps: `[...]` int32, how many count.
+    """
+
+    returns: Array
+    turns: Array | None
+    num_steps: Array
+
+
 class Scorer(NamedTuple):
     """What trials were worth.
 
     names: of the K tasks.
-    score: `(transitions [..., T, *], constants [...]) -> (returns [..., K], turns)`,
-      with turns `[...]`, or None for a robot of which none are counted.
+    score: `(transitions [..., T, *], constants [...]) -> Score`.
     """
 
     names: tuple[str, ...]
-    score: Callable[[jaxpets.Transition, Any], tuple[Array, Array | None]]
+    score: Callable[[jaxpets.Transition, Any], Score]
 
 
 def explorers(
@@ -153,23 +165,23 @@ def scorer(robot: Robot) -> Scorer:
     tasks, angle = robot.tasks, robot.angle
     every = jax.tree.map(np.asarray, tasks.params)  # constants of the program
 
-    def score(
-        seen: jaxpets.Transition, constants: Any
-    ) -> tuple[Array, Array | None]:  # fmt: skip
+    def score(seen: jaxpets.Transition, constants: Any) -> Score:
         def reward(task: Any, obs: Array, action: Array, next_obs: Array) -> Array:
             params = with_constants(task, constants)
             return tasks.reward_fn(params, obs, action, next_obs)
 
         rewards = jax.vmap(reward, (0, None, None, None), -1)(every, *seen)
-        returns = jnp.sum(rewards, axis=-2)
-        if angle is None:
-            return returns, None
-        path = seen.next_obs[..., angle]
-        return returns, (path[..., -1] - path[..., 0]) / (2 * jnp.pi)
+        count = jaxpets.datasets.num_stable(seen)[..., None]
+        counts = jnp.arange(rewards.shape[-2]) < count
+        returns = jnp.sum(jnp.where(counts[..., None], rewards, 0.0), axis=-2)
+        turns = None
+        if angle is not None:
+            path = seen.next_obs[..., angle]
+            last = jnp.take_along_axis(path, jnp.maximum(count - 1, 0), axis=-1)
+            turns = (last - path[..., :1])[..., 0] / (2 * jnp.pi)
+        return Score(returns, turns, count[..., 0])
 
-    def per_trial(
-        seen: jaxpets.Transition, constants: Any
-    ) -> tuple[Array, Array | None]:  # fmt: skip
+    def per_trial(seen: jaxpets.Transition, constants: Any) -> Score:
         program = score
         if jax.tree.leaves(constants):
             for _ in seen.obs.shape[:-2]:

@@ -35,7 +35,7 @@ class CheckpointError(RunError):
 
 
 class DivergedError(RunError):
-    """A model or a trial that is no longer finite."""
+    """A model that is no longer finite, or a robot that is not from the start."""
 
     exit_code = 4
 

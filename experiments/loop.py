@@ -90,7 +90,6 @@ def run(
             begin = time.monotonic()
             acts = phase.act(trial, state, act_keys, progress.tick)
             trials = collect(acts)
-            records.check_finite(trials, trial)
             acted = time.monotonic()
             state, fit = phase.learn(place(learn_keys), state, acts.transitions)
             jax.block_until_ready(state)
@@ -98,6 +97,8 @@ def run(
             learned, fit = collect((state, fit))
             labels = phase.labels(trial)
             rows = records.rows(phase.scorer, labels, trials, fit, learned.params)
+            if trial == 1:
+                records.check_begun(rows, steps)
             timed = [{**row, "seconds": seconds} for row in rows]
             folder.record(trial, timed, learned, finite=(learned.params, learned.fit))
             text = f"{phase.name} {trial}/{last}  {records.describe(rows)}"

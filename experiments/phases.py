@@ -184,7 +184,6 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
     with progress.interruptible():
         trials = acting.run(actors, params, keys, num_chunks, progress.tick)
     trials = devices.collect(placement, trials, *devices.AXES)
-    records.check_finite(trials, step)
     arm = rundir.label(config.arm)
     common = {"phase": "zero-shot", "arm": arm, "explored_trials": step}
     labels = [
@@ -241,6 +240,7 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         dataset = run.restore_trial(last, data, part=True).dataset
         rows = slice(int(dataset.size) - config.task_length, int(dataset.size))
         seen = jax.tree.map(lambda x: x[:, :, None, rows], dataset.data)
+        seen = records.until_diverged(seen, run.lost_steps(last))
         keys, _ = acting.split_keys(phase.keys(last))
         constants = acting.constants(robot, tasks.params, keys[..., None])
         shown = Trials(seen, jnp.zeros(()), constants)

@@ -1,9 +1,9 @@
 """From arrays of trials to rows of the log, and to what a video is made of."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 import jaxpets
@@ -16,12 +16,12 @@ from experiments.storage import metrics, pytrees
 _NO_VALUE = jaxpets.optimizers.WORST_VALUE / 1e4
 
 
-def check_finite(trials: Trials, trial: int) -> None:
-    """Raises DivergedError if the simulator left the finite numbers."""
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(trials)):
+def check_begun(rows: Sequence[dict[str, Any]], num_steps: int) -> None:
+    """Raises DivergedError if a first trial has nothing that can be learned from."""
+    if any(row.get("lost_steps") == num_steps for row in rows):
         raise DivergedError(
-            f"trial {trial} has observations or plan values that are not finite; "
-            "it was not learned from. The last checkpoint is intact."
+            "physics diverged in the first step of the first trial, so that there is "
+            "nothing to learn from. Look at the robot's start, and halve its timestep."
         )
 
 
@@ -41,24 +41,25 @@ def rows(
       fit: with the same leading axes.
       params: the model after fitting, with the same leading axes.
     """
-    returns, turns = scorer.score(trials.transitions, trials.constants)
-    names = scorer.names
+    scored = scorer.score(trials.transitions, trials.constants)
     drawn = pytrees.to_host({"constants": trials.constants})
-    values = np.asarray(trials.values)
-    value, bad = values.mean(axis=-1), (values < _NO_VALUE).sum(axis=-1)
-    flat_returns = np.asarray(returns).reshape(-1, len(names))
+    values, num_steps = np.asarray(trials.values), np.asarray(scored.num_steps)
     table = []
     for i, label in enumerate(labels):
-        named: dict[str, float] = dict(
-            zip(names, flat_returns[i].tolist(), strict=True)
-        )
+        where = np.unravel_index(i, num_steps.shape)
+        returns = np.asarray(scored.returns)[where].tolist()
+        named: dict[str, float] = dict(zip(scorer.names, returns, strict=True))
         own = None if fit is None or params is None else _fit(fit, params, i)
-        net = None if turns is None else np.asarray(turns).flat[i].item()
-        row = metrics.row(label, value.flat[i].item(), net, named, own)
-        where = np.unravel_index(i, value.shape)
+        net = None if scored.turns is None else np.asarray(scored.turns)[where].item()
+        # Where physics diverged, the last plan was still of a state that was finite.
+        plans = values[where][: num_steps[where] + 1]
+        row = metrics.row(label, plans.mean().item(), net, named, own)
         row |= {name: x[where].tolist() for name, x in drawn.items()}
-        count = bad.flat[i].item()
-        table.append(row | {"bad_plans": count} if count else row)
+        counts = {
+            "bad_plans": (plans < _NO_VALUE).sum().item(),
+            "lost_steps": values.shape[-1] - num_steps[where].item(),
+        }
+        table.append(row | {name: count for name, count in counts.items() if count})
     return table
 
 
@@ -78,21 +79,39 @@ def trajectories(
 ) -> dict[str, np.ndarray]:
     """Returns the observations of trials `[S, K, R, T, *]` and what they belong to.
 
-    Their constants, where they have any, are `constants/NAME`, `[S, K, R, *]`.
+    Their constants, where they have any, are `constants/NAME`, `[S, K, R, *]`. The
+    observations are NaN from where physics diverged on.
     """
     transitions = trials.transitions
     drawn = pytrees.to_host({"constants": trials.constants})
-    returns, _ = scorer.score(transitions, trials.constants)
+    scored = scorer.score(transitions, trials.constants)
     columns = [scorer.names.index(task) for task in tasks]
-    own = [np.asarray(returns)[:, k, :, c] for k, c in enumerate(columns)]
+    own = [np.asarray(scored.returns)[:, k, :, c] for k, c in enumerate(columns)]
+    path = np.array(transitions.next_obs)
+    ends = np.asarray(scored.num_steps)[..., None]
+    path[np.arange(path.shape[-2]) >= ends] = np.nan
     return {
-        "obs": np.asarray(transitions.next_obs),
+        "obs": path,
         "action": np.asarray(transitions.action),
         "seeds": np.asarray(seeds),
         "tasks": np.asarray(tasks),
         "returns": np.stack(own, 1),
         **drawn,
     }
+
+
+def until_diverged(seen: jaxpets.Transition, lost: Sequence[int]) -> jaxpets.Transition:
+    """Returns trials of a dataset as they were: NaN where other rows took a place.
+
+    Args:
+      seen: `[..., T, *]`.
+      lost: steps of every trial, as the log has them; of none if it has lost them.
+    """
+    path = np.array(seen.next_obs)
+    if len(lost) == math.prod(path.shape[:-2]):
+        ends = path.shape[-2] - np.reshape(lost, path.shape[:-2])
+        path[np.arange(path.shape[-2]) >= ends[..., None]] = np.nan
+    return seen._replace(next_obs=path)
 
 
 def describe(rows: Sequence[dict[str, Any]]) -> str:
@@ -106,7 +125,7 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
         if own:
             parts.append(f"{name} {np.mean(own):.0f}")
     value = np.mean([row["value"] for row in rows])
-    text = "  ".join([f"value {value:.3g}", "returns:", *parts])
+    text = "  ".join([f"value {value:.3g}", "returns:", *parts, *_diverged(rows)])
     bad = sum(row.get("bad_plans", 0) for row in rows)
     skipped = sum(row.get("fit", {}).get("num_skipped", 0) for row in rows)
     counts = {"bad plans": bad, "updates refused": skipped}
@@ -123,4 +142,13 @@ def summary(
         own = [row["return"] for row in rows if row["task"] == task]
         each = " ".join(f"{value:.0f}" for value in own)
         lines.append(f"  {task:<{width}}{sum(own) / len(own):8.0f}   trials: {each}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"  {line}" for line in _diverged(rows))])
+
+
+def _diverged(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Returns what is to be said of trials in which physics diverged, if any."""
+    lost = [row["lost_steps"] for row in rows if "lost_steps" in row]
+    if not lost:
+        return []
+    share = f"{len(lost)} of {len(rows)} trials"
+    return [f"physics diverged in {share}: {sum(lost)} steps lost"]

@@ -33,6 +33,7 @@ def sentences(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
         *_trials(rows),
         *_missing(rows, found, explored),
         *_not_finite(rows),
+        *_diverged(rows),
         *_torn({row.run for row in rows}),
         *_unequal({row.run: row.phase for row in rows}),
     ]
@@ -122,6 +123,21 @@ def _not_finite(rows: Sequence[Row]) -> Iterator[str]:
             if bad:
                 share = f"{bad} of {len(values)} returns"
                 yield f"`{arm}`: {share} of {phase} are not finite; left out."
+
+
+def _diverged(rows: Sequence[Row]) -> Iterator[str]:
+    """Counts the trials that ended where physics diverged."""
+    trials = Counter((row.arm, row.phase) for row in rows)
+    lost: dict[tuple[str, str], list[int]] = {}
+    for row in rows:
+        if count := row.data.get("lost_steps"):
+            lost.setdefault((row.arm, row.phase), []).append(count)
+    for (arm, phase), counts in sorted(lost.items()):
+        share = f"{len(counts)} of {trials[arm, phase]} trials of {phase}"
+        yield (
+            f"`{arm}`: physics diverged in {share}; {sum(counts)} steps are lost, and "
+            "returns count what was earned before."
+        )
 
 
 def _torn(runs: Iterable[Path]) -> Iterator[str]:

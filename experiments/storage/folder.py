@@ -170,6 +170,10 @@ class RunFolder(NamedTuple):
         if self.status is not None:
             self.status.end(status.INTERRUPTED, reason)
 
+    def lost_steps(self, trial: int) -> list[int]:
+        """Returns, of every row of a trial, the steps from where physics diverged."""
+        return distributed.on_first(lambda: metrics.lost_steps(self._log, trial))
+
     @property
     def trajectories(self) -> Path:
         """The file of `save_trajectories`."""

@@ -9,6 +9,8 @@ A row is a trial of a seed, and of a task where one is sought:
                              which none are counted
     bad_plans                steps whose every candidate was imagined to be not finite;
                              left out where there is none
+    lost_steps               those from where physics diverged on: they are not learned
+                             from and earn nothing; left out where there are none
     returns                  of the trial under every task; return is that of its own
     fit                      of the model after the trial, where there was one
     seconds                  act and fit
@@ -86,6 +88,7 @@ class _Line(msgspec.Struct, kw_only=True, tag_field="phase"):
     returns: dict[str, float | None] | None = None
     fit: dict[str, float | None] | None = None
     seconds: dict[str, float | None] | None = None
+    lost_steps: int = 0
 
 
 class _Explore(_Line, tag="explore"):
@@ -136,6 +139,13 @@ def _parsed(data: Any, config: Mapping[str, Any], run: Path) -> Row:
         data=data,
         run=run,
     )
+
+
+def lost_steps(path: Path, trial: int) -> list[int]:
+    """Returns, of every row of a trial, the steps from where physics diverged on."""
+    rows = [json.loads(line) for line, found in _trials(path) if found == trial]
+    counts = [row.get("lost_steps", 0) for row in rows]
+    return [count if type(count) is int else 0 for count in counts]
 
 
 def append_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

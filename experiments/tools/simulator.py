@@ -67,7 +67,7 @@ def perform(args: Arguments, robot: Robot) -> np.ndarray:
             length=args.trial_length,
             observe_fn=lambda state: state,
         )
-        return score(transitions, constants)[0]
+        return score(transitions, constants).returns
 
     trials = jax.jit(jax.vmap(jax.vmap(trial, (None, 0)), (0, None)))
     keys = jax.random.split(jax.random.key(args.seed), args.num_trials)

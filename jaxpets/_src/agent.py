@@ -176,7 +176,7 @@ class Agent:
           obs: `[D]` or `[N, D]`, what is seen now; any floats.
 
         Raises:
-          TypeError, ValueError: if it is not of this shape, or not finite.
+          TypeError, ValueError: if it is not of this shape, or one world's not finite.
         """
         seen = told.numbers(self._world, "obs", obs)
         planner, reward = self._task or (self._planner, self._state.reward)
@@ -210,7 +210,8 @@ class Agent:
         """Remembers what the last action led to.
 
         A transition goes from the `obs` that `act` saw to `next_obs`, and never from
-        the end of a trial to the start of the next.
+        the end of a trial to the start of the next. Of N worlds, one that has diverged
+        does not stop the others: only its transitions are left out.
 
         Args:
           next_obs: `[D]` or `[N, D]`.
@@ -220,8 +221,8 @@ class Agent:
 
         Raises:
           RuntimeError: if no action waits for its outcome.
-          TypeError, ValueError: if an argument is not of this shape, or an observation
-            not finite; nothing of this step is kept then.
+          TypeError, ValueError: if an argument is not of this shape, or of a single
+            world and not finite; nothing of this step is kept then.
         """
         if self._awaited is None:
             raise RuntimeError(
@@ -232,7 +233,8 @@ class Agent:
         done = done | told.flags(world, "truncated", truncated)
         reached = told.last_obs(world, next_obs, done, info)
         obs, action = self._awaited
-        kept = ~self._is_resetting
+        is_finite = told.are_finite(obs, reached)
+        kept = ~self._is_resetting & is_finite
         self._seen.append((obs[kept], action[kept], reached[kept]))
         steps = self._counts.steps + int(kept.sum())
         self._counts = self._counts._replace(steps=steps)
@@ -240,9 +242,10 @@ class Agent:
         if world.autoreset == "NextStep":
             # The next step of these worlds leads from an end to a start.
             self._is_new |= self._is_resetting
-            self._is_resetting = done & kept
+            self._is_resetting = done & ~self._is_resetting
         else:
             self._is_new |= done
+        self._is_new |= ~is_finite
 
     def learn(self) -> FitMetrics:
         """Trains the model on all that was observed; best called after a trial.
@@ -264,7 +267,7 @@ class Agent:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes all that it has learned and seen to one file, without pickle.
 
-        Not the trial that is going on, nor the functions that the agent is made of.
+        Not the trial that is going on, nor the functions that it is made of.
         """
         self._remember()
         agent_file.write(path, self._state, self._counts)

@@ -48,8 +48,11 @@ def autoreset_of(value: Any, num_envs: int | None) -> str:
 def numbers(world: World, name: str, value: Any) -> np.ndarray:
     """Returns a copy of observations as float32, `[D]` or `[N, D]`.
 
+    Of N worlds one may have diverged, which the others cannot help; see `are_finite`.
+
     Raises:
-      TypeError, ValueError: if they are not of this shape, or not finite.
+      TypeError, ValueError: if they are not of this shape, or of a single world and
+        not finite.
     """
     shape = (*world.lead, world.obs_size)
     try:
@@ -62,11 +65,16 @@ def numbers(world: World, name: str, value: Any) -> np.ndarray:
         ) from error
     if array.shape != shape:
         raise ValueError(f"{name} must be of shape {shape}, got {array.shape}.")
-    if not np.isfinite(array).all():
+    if world.num_envs is None and not np.isfinite(array).all():
         entry = np.argwhere(~np.isfinite(array))[0].tolist()
         got = array[tuple(entry)]
         raise ValueError(f"{name} must be finite, got {got} in entry {entry}.")
     return array
+
+
+def are_finite(*arrays: np.ndarray) -> np.ndarray:
+    """Tells `[]` or `[N]` which worlds have finite numbers in all of `[..., *]`."""
+    return np.logical_and.reduce([np.isfinite(x).all(axis=-1) for x in arrays])
 
 
 def flags(world: World, name: str, value: Any) -> np.ndarray:

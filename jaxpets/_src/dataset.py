@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -15,6 +16,8 @@ _SHARED: Any = None
 # is the trip count of one plain loop over batches; mapped, every step of that loop
 # would select between old and new parameters: a third more time on a GPU.
 AXES = Dataset(data=_MAPPED, size=_SHARED, cursor=_SHARED)
+# What MuJoCo holds for diverged, its mjMAXVAL. Squares of less fit into float32.
+_MAX_SIZE = 1e10
 
 
 def init(capacity: int, obs_size: int, action_size: int) -> Dataset:
@@ -54,19 +57,8 @@ def append(
     Raises:
       TypeError, ValueError: if a record, a width, a length or a dtype does not fit.
     """
-    check_record("dataset", dataset, Dataset)
-    check_record("transitions", transitions, Transition)
-    capacity, obs_size = dataset.data.obs.shape
-    check_array("transitions.obs", transitions.obs, ["T", obs_size])
-    length = transitions.obs.shape[0]
-    if length > capacity:
-        raise ValueError(
-            f"transitions must fit the capacity of {capacity}, got {length} rows."
-        )
-    check_array("transitions.obs", transitions.obs, [length, obs_size])
-    check_array("transitions.next_obs", transitions.next_obs, [length, obs_size])
-    action_size = dataset.data.action.shape[1]
-    check_array("transitions.action", transitions.action, [length, action_size])
+    _check_rows(dataset, transitions)
+    length, capacity = len(transitions.obs), len(dataset.data.obs)
     rows = (dataset.cursor + jnp.arange(length, dtype=jnp.int32)) % capacity
     added: int | Array = length
     if count is not None:
@@ -81,6 +73,81 @@ def append(
     )
     size = jnp.minimum(dataset.size + added, capacity)
     return Dataset(data, size, (dataset.cursor + added) % capacity)
+
+
+def num_stable(transitions: Transition) -> Array:
+    """Returns how many of T rows came before physics diverged, `[...]` int32.
+
+    It has diverged from the first row on that has a number which is not finite, or
+    beyond 1e10, which MuJoCo holds for the same. The rows that blew up to there, each
+    with a largest number of more than twice the one before, belong to it: one of them
+    would set the scale of all that is learned.
+
+    Args:
+      transitions: `[..., T, *]`.
+
+    >>> import jax.numpy as jnp
+    >>> path = jnp.float32([[1.0], [3.0], [2.0], [4.0], [90.0], [7e5], [jnp.nan]])
+    >>> num_stable(Transition(path[:-1], path[:-1], path[1:])).tolist()
+    3
+    """
+    check_record("transitions", transitions, Transition)
+    obs, action, next_obs = (jnp.max(jnp.abs(x), axis=-1) for x in transitions)
+    is_good = (obs <= _MAX_SIZE) & (action <= _MAX_SIZE) & (next_obs <= _MAX_SIZE)
+    step = jnp.arange(is_good.shape[-1], dtype=jnp.int32)
+    is_before = jax.lax.cummin(is_good.astype(jnp.int32), axis=is_good.ndim - 1) > 0
+    # At the start of a trial, from rest, everything grows.
+    is_stable = (next_obs <= 2.0 * obs) | (step == 0)
+    last = jnp.max(jnp.where(is_before & is_stable, step, -1), axis=-1)
+    return jnp.where(jnp.all(is_good, axis=-1), len(step), last + 1)
+
+
+def append_stable(dataset: Dataset, transitions: Transition) -> Dataset:
+    """Returns the dataset with T more rows, none of them from where physics diverged.
+
+    The rows of `num_stable` are appended. Seeds share the size of their data, which
+    grows by T for all of them: the places that are left are taken by rows that are
+    there, once more, spread evenly over the data; by zeros where nothing is there yet.
+
+    Args:
+      dataset: what there is.
+      transitions: `[T, D]`, `[T, A]`, `[T, D]`, T at most the capacity.
+
+    Raises:
+      TypeError, ValueError: as from `append`.
+    """
+    _check_rows(dataset, transitions)
+    length, capacity = len(transitions.obs), len(dataset.data.obs)
+    kept = num_stable(transitions)
+    known = append(dataset, transitions, kept)
+    step = jnp.arange(length, dtype=jnp.int32)
+    num_lost = jnp.maximum(length - kept, 1)
+    each, rest = jnp.divmod(known.size, num_lost)  # a product of two sizes is too large
+    lost = jnp.maximum(step - kept, 0)
+    again = lost * each + lost * rest // num_lost
+    # Beyond the last row nothing is written.
+    places = (dataset.cursor + step) % capacity
+    places = jnp.where(step < kept, capacity, places)
+    data = Transition(*(rows.at[places].set(rows[again]) for rows in known.data))
+    size = jnp.minimum(dataset.size + length, capacity)
+    return Dataset(data, size, (dataset.cursor + length) % capacity)
+
+
+def _check_rows(dataset: Dataset, transitions: Transition) -> None:
+    """Raises unless rows of one length are what the dataset holds, and fit into it."""
+    check_record("dataset", dataset, Dataset)
+    check_record("transitions", transitions, Transition)
+    capacity, obs_size = dataset.data.obs.shape
+    check_array("transitions.obs", transitions.obs, ["T", obs_size])
+    length = transitions.obs.shape[0]
+    if length > capacity:
+        raise ValueError(
+            f"transitions must fit the capacity of {capacity}, got {length} rows."
+        )
+    check_array("transitions.obs", transitions.obs, [length, obs_size])
+    check_array("transitions.next_obs", transitions.next_obs, [length, obs_size])
+    action_size = dataset.data.action.shape[1]
+    check_array("transitions.action", transitions.action, [length, action_size])
 
 
 def grow(dataset: Dataset, capacity: int) -> Dataset:

@@ -79,7 +79,7 @@ class Learner(NamedTuple):
     Attributes:
       init: `(key) -> LearnerState`.
       learn: `(key, state, transitions [T, ...]) -> (state, FitMetrics)`: appends, fits,
-        refreshes the reward data.
+        refreshes the reward data. From where physics diverged on, nothing is learned.
       step: `(planner, key, state) -> (state, TrialOutput)`: resets the environment,
         unrolls the planner and learns from what happened.
     """
@@ -103,6 +103,10 @@ def learner(
     The planner is an argument of `step`, so the first trial may be a random one. A
     jitted trial is `jax.jit(learner.step, static_argnums=0)`, and many seeds are
     `jaxpets.over_seeds(learner, num_seeds)`.
+
+    Where physics diverges, a trial has ended: of its T steps the first
+    `jaxpets.datasets.num_stable(output.transitions)` are learned from. In the data,
+    whose size all seeds share, rows that are there take the places of the others.
 
     Args:
       env: where to act.
@@ -144,7 +148,7 @@ def learner(
     ) -> tuple[LearnerState, FitMetrics]:
         check_key("key", key)
         check_record("state", state, LearnerState)
-        dataset = datasets.append(state.dataset, transitions)
+        dataset = datasets.append_stable(state.dataset, transitions)
         return fitted(fitter, reward_data, key, state._replace(dataset=dataset))
 
     def step(

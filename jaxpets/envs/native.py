@@ -32,7 +32,8 @@ PhysicsFn = Callable[[Array, Array, Array, Any, Array], tuple[Array, Array, Arra
 
 # To wake a thread takes about as long as two environment steps of HalfCheetah.
 _MIN_ROWS_PER_THREAD = 4
-# Where the clock of every step starts; MuJoCo sets it to 0 when it resets a state.
+# Where the clock of every step starts; MuJoCo sets it to 0 when it resets a state, in
+# any substep, and then goes on.
 _START_TIME = 1.0
 
 
@@ -79,7 +80,9 @@ def native_physics(
         c.mj_step(model, data, num_substeps)
         c.mj_getState(model, data, row, _INPUTS)
 
-    run = _host_function(model, visit, size, num_threads)
+    run = _host_function(
+        model, visit, size, num_threads, num_substeps * model.opt.timestep
+    )
 
     def step(
         qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
@@ -153,6 +156,7 @@ def _host_function(
     visit: Callable[[np.ndarray, Any], None],
     size: int,
     num_threads: int | None,
+    duration: float = 0.0,
 ) -> Callable[..., Array]:
     """Builds a function of JAX that has C MuJoCo visit every row of a batch.
 
@@ -162,6 +166,7 @@ def _host_function(
         scratch of its own thread.
       size: how many numbers are left in a row.
       num_threads: at most this many; by default the cores this process may use.
+      duration: by how much a visit moves the clock, in s.
     """
     if num_threads is None:
         num_threads = _num_cores()
@@ -197,7 +202,8 @@ def _host_function(
         rows = np.full((len(flat), width), _START_TIME, np.float64)
         rows[:, 1 : 1 + flat.shape[1]] = flat
         visit_batch(rows)
-        rows[rows[:, 0] < _START_TIME] = np.nan
+        # A clock that was set back shows at most the duration.
+        rows[rows[:, 0] < duration + 0.5 * _START_TIME] = np.nan
         outputs = rows[:, 1 : 1 + size].astype(np.float32)
         return outputs.reshape(*inputs.shape[:-1], size)
 

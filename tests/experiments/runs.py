@@ -50,11 +50,11 @@ def explore(out, *seeds):
     return out / NAME
 
 
-def unfinished(folder, out):
+def unfinished(folder, out, last=LAST):
     """Returns a copy of a run whose last trial is not saved."""
-    shutil.copytree(folder, out / NAME)
-    shutil.rmtree(out / NAME / "checkpoints" / str(LAST))
-    return out / NAME
+    shutil.copytree(folder, out / folder.name)
+    shutil.rmtree(out / folder.name / "checkpoints" / str(last))
+    return out / folder.name
 
 
 def rows(folder):

@@ -254,6 +254,28 @@ def test_what_a_world_may_not_say(make, trained):
         two.observe(np.zeros((2, 2)), ended, info={"final_obs": [at(0)]})
 
 
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_world_that_diverges_does_not_stop_the_others(make, trained, mode):
+    """The first of two ends in NaN, and is at 5 in its new trial; the other counts."""
+    agent, both = make(num_envs=2, params=trained, autoreset=mode), np.ones(2, bool)
+    agent.reset()
+    steps = [
+        [[0, 0], [0, 0]],
+        [[np.nan, 0], [1, 0]],
+        [[5, 0], [2, 0]],
+        [[6, 0], [3, 0]],
+    ]
+    path = np.array(steps)
+    for step, obs in enumerate(path[:-1]):
+        action = agent.act(obs)
+        # Each time the world 0 plans anew, its planner has counted no step.
+        assert action[1] == pytest.approx(max(-1, -step) + 1e-3 * step)
+        final = {"final_obs": [[np.nan, 0], None]}
+        agent.observe(path[step + 1], both * [step == 0, False], info=final)
+    assert action[0] == pytest.approx(-1.0)
+    assert rows(agent) == [(0, 1), (1, 2), (5, 6), (2, 3)] and agent.num_steps == 4
+
+
 def test_what_an_agent_may_not_be_made_of(make, parts):
     with pytest.raises(ValueError, match=r"autoreset must be one of .*, got 'never'"):
         make(autoreset="never")

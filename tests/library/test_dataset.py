@@ -8,6 +8,7 @@ import toys
 
 import jaxpets
 from jaxpets import Transition
+from jaxpets._src.dataset import AXES, append_stable
 
 CAPACITY = 8
 
@@ -25,6 +26,14 @@ def held(dataset):
     np.testing.assert_array_equal(dataset.data.action[:size, 0], -obs)
     np.testing.assert_array_equal(dataset.data.next_obs[:size, 1], obs + 0.5)
     return sorted(obs.tolist())
+
+
+def held_in_order(many):
+    """The valid rows' numbers of every seed; all of a row are of one number."""
+    obs, action, next_obs = (np.asarray(x)[:, : int(many.size), 0] for x in many.data)
+    np.testing.assert_array_equal(action, -obs)
+    np.testing.assert_array_equal(next_obs, np.where(obs > 0, obs + 0.5, 0.0))
+    return obs.tolist()
 
 
 def test_starts_empty():
@@ -65,6 +74,53 @@ def test_eager_append_keeps_the_avals():
     assert toys.avals(jaxpets.datasets.append(dataset, numbered(0, 3))) == toys.avals(
         dataset
     )
+
+
+def test_what_comes_after_physics_diverged_is_no_data():
+    rows = jax.tree.map(np.asarray, numbered(0, 5))
+    cases = [rows]
+    for name in Transition._fields:
+        for number in (np.nan, -np.inf, 2e10):
+            bad = getattr(rows, name).copy()
+            bad[3, 0] = number
+            cases.append(rows._replace(**{name: bad}))
+    many = jax.tree.map(lambda *x: np.stack(x), *cases)
+    many = jax.tree.map(lambda x: np.stack([x, x[:, ::-1]]), many)
+    found = jaxpets.datasets.num_stable(many)
+    assert found.dtype == jnp.int32
+    assert found.tolist() == [[5] + [3] * 9, [5] + [1] * 9]
+
+
+def test_what_blew_up_to_there_is_no_data_either():
+    path = np.float32([0, 1, 4, 6, 13, 80, 70, 150, np.inf])[:, None]
+    rows = Transition(path[:-1], 0 * path[:-1], path[1:])
+    assert jaxpets.datasets.num_stable(rows) == 6  # 70 is not more than 80
+    for count in (2, 3, 5, 7):  # whatever has grown, if it did not diverge
+        part = jax.tree.map(lambda x, count=count: x[:count], rows)
+        assert jaxpets.datasets.num_stable(part) == count
+
+
+def test_rows_that_are_there_take_the_places_of_those_that_are_lost():
+    """So that the sizes of seeds are equal, wherever each of them diverged."""
+    append = jax.jit(jax.vmap(append_stable, (AXES, 0), AXES))
+    empty = jaxpets.datasets.init(CAPACITY, 2, 1)
+    data = jax.tree.map(lambda x: jnp.stack([x] * 4), empty.data)
+    many = empty._replace(data=data)
+    found = []
+    for first in (0, 3, 6):
+        rows = jax.tree.map(lambda x: jnp.stack([x] * 4), numbered(first + 1, 3))
+        for seed, bad in ((1, 4), (2, 0), (2, 4), (3, 7)):
+            if first <= bad < first + 3:
+                at = rows.next_obs.at[seed, bad - first :, 1].set(jnp.nan)
+                rows = rows._replace(next_obs=at)
+        many = append(many, rows)
+        found.append(held_in_order(many))
+    assert found[0] == [[1, 2, 3], [1, 2, 3], [0, 0, 0], [1, 2, 3]]
+    assert found[1][:3] == [[1, 2, 3, 4, 5, 6], [1, 2, 3, 4, 1, 3], [0, 0, 0, 4, 0, 0]]
+    # Full, it begins with the oldest again.
+    assert found[2][0] == [9, 2, 3, 4, 5, 6, 7, 8]
+    assert found[2][3] == [4, 2, 3, 4, 5, 6, 7, 1]
+    assert many.size == CAPACITY and many.cursor == 1
 
 
 @pytest.mark.parametrize("count", [0, 5, 8, 11])

@@ -144,6 +144,15 @@ def test_what_is_not_finite_is_nan_and_stays_alone(env, states, actions, after):
     assert_same(again.physics, first(count, after.physics))
 
 
+def test_a_reset_is_seen_however_long_a_step_is(model, states):
+    """MuJoCo goes on from a state that it has reset, here for two seconds."""
+    step = jax.vmap(native.native_physics(model, num_substeps=200))
+    qpos, qvel, warmstart, _ = first(2, states).physics
+    fast = Physics(qpos, qvel.at[0, 2].set(1e9), warmstart)
+    got = step(*fast, jnp.zeros((2, 6), jnp.float32))[0]
+    assert np.isnan(got[0]).all() and np.isfinite(got[1]).all()
+
+
 def test_actions_are_clipped_even_when_infinite(env, states):
     state = first(3, states)
     wild = jnp.array([jnp.inf, -jnp.inf, 3.0, -1e30, 1.0, 0.5], jnp.float32)
