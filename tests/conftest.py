@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from importlib import metadata
 from pathlib import Path
 
 # Before jax is imported. For the tests marked gpu: JAX_PLATFORMS=cuda,cpu.
@@ -15,7 +16,9 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # optimisations and XLA's fused loops: without them the suite takes half of the time.
 # Flags of the user's own come last, and win; processes that tests start inherit these.
 if os.environ["JAX_PLATFORMS"] == "cpu":
-    _flags = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    _flags = "--xla_backend_optimization_level=0"
+    if metadata.version("jaxlib").startswith("0.10."):  # later ones do not know it
+        _flags += " --xla_cpu_use_fusion_emitters=false"
     os.environ["XLA_FLAGS"] = f"{_flags} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 import jax
