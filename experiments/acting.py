@@ -112,6 +112,7 @@ def run(
     """
     reset_keys, act_keys = map(actors.place, split_keys(keys))
     state = actors.start(params.reward, reset_keys)
+    drawn = state.env.constants  # until a trial ends and another begins
     chunks = []
     for _ in range(num_chunks):
         state, transitions, values = actors.chunk(params, act_keys, state)
@@ -122,7 +123,7 @@ def run(
     transitions, values = jax.tree.map(
         lambda *parts: jnp.concatenate(parts, axis=time), *chunks
     )
-    return Trials(transitions, values, state.env.constants)
+    return Trials(transitions, values, drawn)
 
 
 def constants(robot: Robot, tasks: Any, keys: Array) -> Any:
@@ -149,8 +150,11 @@ def split_keys(keys: Array) -> tuple[Array, Array]:
 
 
 def scorer(robot: Robot) -> Scorer:
-    """Returns what scores trials of a robot; jitted once for all of a run."""
-    tasks, angle = robot.tasks, robot.angle
+    """Returns what scores trials of a robot; jitted once for all of a run.
+
+    What comes after the first end of a trial, from a new start, does not count.
+    """
+    tasks, angle, ends = robot.tasks, robot.angle, robot.env.terminal_fn
     every = jax.tree.map(np.asarray, tasks.params)  # constants of the program
 
     def score(
@@ -161,11 +165,19 @@ def scorer(robot: Robot) -> Scorer:
             return tasks.reward_fn(params, obs, action, next_obs)
 
         rewards = jax.vmap(reward, (0, None, None, None), -1)(every, *seen)
+        if ends is not None:
+            ended = ends(seen.next_obs).astype(jnp.int32)
+            counts = jnp.cumsum(ended, axis=-1) == ended  # nothing ended before
+            rewards = jnp.where(counts[..., None], rewards, 0.0)
         returns = jnp.sum(rewards, axis=-2)
         if angle is None:
             return returns, None
         path = seen.next_obs[..., angle]
-        return returns, (path[..., -1] - path[..., 0]) / (2 * jnp.pi)
+        last = path[..., -1]
+        if ends is not None:
+            place = jnp.sum(counts, axis=-1, keepdims=True) - 1
+            last = jnp.take_along_axis(path, place, axis=-1)[..., 0]
+        return returns, (last - path[..., 0]) / (2 * jnp.pi)
 
     def per_trial(
         seen: jaxpets.Transition, constants: Any

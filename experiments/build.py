@@ -55,6 +55,7 @@ def build(config: Config) -> Parts:
     size = ensemble_config(config.model)
     trained = _ensemble(robot, size, jaxpets.Precision.TF32)
     arm = make_arm(config, _planned(config, robot), robot)
+    terminal_fn = env.terminal_fn and _imagined_end(env.terminal_fn)
     explored = config.num_trials * config.trial_length
     finetuned = config.finetune_trials * config.task_length
 
@@ -64,7 +65,8 @@ def build(config: Config) -> Parts:
         rollout, kind = _rollout(robot, size, search)
         unroll = kind.startswith(KERNEL) and jax.default_backend() == "gpu"
         search_fn = optimizer(search, env, unroll)
-        return jaxpets.plan(rollout, reward_fn, search_fn), kind
+        planner = jaxpets.plan(rollout, reward_fn, search_fn, terminal_fn=terminal_fn)
+        return planner, kind
 
     reward = robot.tasks.reward_fn
     if config.pessimism:
@@ -163,6 +165,13 @@ def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
         hidden_sizes=(model.hidden_size,) * model.num_layers,
         state_margin=model.state_margin,
     )
+
+
+def _imagined_end(
+    terminal_fn: Callable[[Array], Array],
+) -> Callable[[Any, Array], Array]:
+    """Returns what ends an imagined trial where a real one ends."""
+    return lambda params, obs: terminal_fn(obs)
 
 
 def _fitter(

@@ -248,7 +248,10 @@ def _opened(env: str | None, obs: np.ndarray, look: Look) -> tuple[Draw, np.ndar
         reason = str(error).splitlines() or [type(error).__name__]
         print(f"error: {reason[0]}", file=sys.stderr)
         raise SystemExit(_NO_GL) from error
-    return draw, np.asarray(robot.qpos_fn(jnp.asarray(obs)))
+    try:
+        return draw, np.asarray(robot.qpos_fn(jnp.asarray(obs)))
+    except ValueError as error:
+        raise UsageError(f"--env {env} cannot be drawn; {error}") from error
 
 
 def _gif_steps(args: argparse.Namespace, num_steps: int) -> range:

@@ -205,7 +205,9 @@ def test_robots_are_listed(capsys, monkeypatch):
     assert main(["--list", "envs"]) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert head.split() == ["name", "observation", "action", "tasks"]
-    assert [line.split()[0] for line in lines] == list(envs.names())
+    packages = ["brax/NAME", "playground/NAME"]
+    assert [line.split()[0] for line in lines] == [*some, *packages]
+    assert lines[-1].endswith("own, of any NAME in mujoco_playground.registry")
     assert "18" in lines[0] and lines[0].endswith("front-flip, back-flip")
     assert "stand, walk, run" in next(x for x in lines if x.startswith("dmc/walker"))
     assert main(["--list", "arms"]) == 2

@@ -1,0 +1,179 @@
+"""Robots of the registries of Brax and MuJoCo Playground, under their names there.
+
+Their one task, `own`, is the reward that they come with: it is observed, as the entry
+`reward`, and a model learns to predict it like any other. Besides:
+
+- An observation is theirs. Nobody says what its entries are, so all of them are
+  predicted by their change; angles are not treated as such.
+- They are stepped by the package's own engine, in JAX on the device.
+- Where Brax ends a trial it ends (`Env.terminal_fn`), and the entry `done` lets a
+  planner foresee that. Playground's robots go on: those of its control suite end only
+  where physics fails, and their long way to a start would be gone with every step.
+- They are drawn if their observation begins with positions, as most do.
+"""
+
+import contextlib
+import importlib
+import io
+import warnings
+from collections.abc import Callable, Generator, Mapping
+from operator import attrgetter
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxpets._src.checks import nearest
+from jaxpets._src.coordinates import index, space
+from jaxpets._src.types import RewardFn
+from jaxpets.envs.adapters import from_brax
+from jaxpets.envs.extra import needs_extra
+from jaxpets.envs.robot import Robot, tasks_of
+
+_MOST_MISSING = 2  # the root's x and y
+
+
+class Registry(NamedTuple):
+    """Where a package has its environments, as names of attributes.
+
+    Attributes:
+      extra: which brings the package.
+      module: to import.
+      names: of the module, an iterable.
+      load: of the module, `(name, **options) -> environment`.
+      options: of `load`.
+      model: of an environment, an MjModel.
+      positions: of a state, and velocities.
+      keep: as `from_brax` takes it.
+    """
+
+    extra: str
+    module: str
+    names: str
+    load: str
+    options: Mapping[str, Any]
+    model: str
+    positions: tuple[str, str]
+    keep: tuple[str, ...]
+
+
+REGISTRIES: Mapping[str, Registry] = {
+    "brax": Registry(
+        extra="envs",
+        module="brax.envs",
+        names="_envs",
+        load="get_environment",
+        options={},
+        model="sys.mj_model",
+        positions=("pipeline_state.q", "pipeline_state.qd"),
+        keep=("reward", "done"),
+    ),
+    "playground": Registry(
+        extra="playground",
+        module="mujoco_playground.registry",
+        names="ALL_ENVS",
+        load="load",
+        # Its default is Warp, which is for GPUs of one maker.
+        options={"config_overrides": {"impl": "jax"}},
+        model="mj_model",
+        positions=("data.qpos", "data.qvel"),
+        keep=("reward",),
+    ),
+}
+"""By the word before the slash."""
+
+
+def registered(package: str, name: str) -> Robot:
+    """Builds one robot.
+
+    Args:
+      package: of REGISTRIES.
+      name: as the package has it.
+
+    Raises:
+      ImportError: without the package; it names the extra.
+      ValueError: if it has no such name, the nearest are said; or cannot make what it
+        names, or that does not observe a vector.
+    """
+    registry = REGISTRIES[package]
+    with needs_extra(registry.extra), _quiet():
+        module = importlib.import_module(registry.module)
+    names: tuple[str, ...] = tuple(getattr(module, registry.names))
+    if name not in names:
+        near = ", ".join(f"{package}/{x}" for x in nearest(name, names) or names)
+        raise ValueError(
+            f"name must be a robot of {registry.module}, as {near}, got "
+            f"{f'{package}/{name}'!r}."
+        )
+    load: Callable[..., Any] = getattr(module, registry.load)
+    try:
+        with _quiet(), jax.numpy_dtype_promotion("standard"):
+            world = load(name, **registry.options)
+    except Exception as error:  # of the package's, of any kind
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"{registry.module} cannot make {name}: {reason}.") from error
+    env = from_brax(world, keep=registry.keep)
+
+    def qpos_fn(obs: Array) -> Array:
+        # What is not asked for here is not computed.
+        def start() -> _Start:
+            state = env.reset(jax.random.key(0))
+            return _Start(state.obs, *attrgetter(*registry.positions)(state.physics))
+
+        found = cast(_Start, jax.jit(start)())
+        return _track(found, obs, float(world.dt))
+
+    return Robot(
+        name=f"{package}/{name}",
+        env=env,
+        space=space(env.coordinates),
+        tasks=tasks_of({"own": _own(index(env.coordinates, "reward"))}),
+        model=attrgetter(registry.model)(world),
+        qpos_fn=qpos_fn,
+    )
+
+
+def _own(place: int) -> RewardFn:
+    def own(constants: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        del constants, obs, action
+        return next_obs[..., place]
+
+    return own
+
+
+class _Start(NamedTuple):
+    """What tells where positions are in an observation: both, as a trial starts."""
+
+    obs: Array  # [D]
+    qpos: Array  # [Q]
+    qvel: Array  # [V]
+
+
+def _track(start: _Start, obs: Array, step_time: float) -> Array:
+    """Returns positions `[T, Q]` of a trial.
+
+    Where the root stands, which many leave out, is where its velocity has brought it.
+
+    Raises:
+      ValueError: if no positions are found.
+    """
+    for missing in range(min(_MOST_MISSING, len(start.qpos) - 1) + 1):
+        size = len(start.qpos) - missing
+        if np.array_equal(start.obs[:size], start.qpos[missing:]):
+            break
+    else:
+        raise ValueError("its observation does not begin with positions.")
+    root = jnp.broadcast_to(start.qpos[:missing], (len(obs), missing))
+    if np.array_equal(start.obs[size : size + len(start.qvel)], start.qvel):
+        root += step_time * jnp.cumsum(obs[:, size : size + missing], axis=0)
+    return jnp.concatenate([root, obs[:, :size]], axis=-1)
+
+
+@contextlib.contextmanager
+def _quiet() -> Generator[None]:
+    """Keeps to itself what packages say of others that they could do with."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield
