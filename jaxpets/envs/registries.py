@@ -115,6 +115,9 @@ def registered(package: str, name: str) -> Robot:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(f"{registry.module} cannot make {name}: {reason}.") from error
     env = from_brax(world, keep=registry.keep)
+    model = None  # of what is not MuJoCo, as Brax's `fast`
+    with contextlib.suppress(AttributeError):
+        model = attrgetter(registry.model)(world)
 
     def qpos_fn(obs: Array) -> Array:
         # What is not asked for here is not computed.
@@ -130,7 +133,7 @@ def registered(package: str, name: str) -> Robot:
         env=env,
         space=space(env.coordinates),
         tasks=tasks_of({"own": _own(index(env.coordinates, "reward"))}),
-        model=attrgetter(registry.model)(world),
+        model=model,
         qpos_fn=qpos_fn,
     )
 
