@@ -25,7 +25,7 @@ def registries() -> dict[str, str]:
 
     The values say where a package lists them, as `brax.envs`; it is not imported.
     """
-    return {package: registry.module for package, registry in REGISTRIES.items()}
+    return {package: registry.where for package, registry in REGISTRIES.items()}
 
 
 def make(name: str, *, backend: str = "mujoco") -> Robot:

@@ -33,6 +33,7 @@ from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.robot import Robot, tasks_of
 
 _MOST_MISSING = 2  # the root's x and y
+_FEW = 2  # positions, of which one that is seen may be a chance
 
 
 class Registry(NamedTuple):
@@ -41,6 +42,7 @@ class Registry(NamedTuple):
     Attributes:
       extra: which brings the package.
       module: to import.
+      where: what has the names, for people.
       names: of the module, an iterable.
       load: of the module, `(name, **options) -> environment`.
       options: of `load`.
@@ -51,6 +53,7 @@ class Registry(NamedTuple):
 
     extra: str
     module: str
+    where: str
     names: str
     load: str
     options: Mapping[str, Any]
@@ -63,6 +66,7 @@ REGISTRIES: Mapping[str, Registry] = {
     "brax": Registry(
         extra="envs",
         module="brax.envs",
+        where="brax.envs",
         names="_envs",
         load="get_environment",
         options={},
@@ -72,9 +76,10 @@ REGISTRIES: Mapping[str, Registry] = {
     ),
     "playground": Registry(
         extra="playground",
-        module="mujoco_playground.registry",
-        names="ALL_ENVS",
-        load="load",
+        module="mujoco_playground",
+        where="mujoco_playground.registry",
+        names="registry.ALL_ENVS",
+        load="registry.load",
         # Its default is Warp, which is for GPUs of one maker.
         options={"config_overrides": {"impl": "jax"}},
         model="mj_model",
@@ -100,24 +105,22 @@ def registered(package: str, name: str) -> Robot:
     registry = REGISTRIES[package]
     with needs_extra(registry.extra), _quiet():
         module = importlib.import_module(registry.module)
-    names: tuple[str, ...] = tuple(getattr(module, registry.names))
+    names: tuple[str, ...] = tuple(attrgetter(registry.names)(module))
     if name not in names:
         near = ", ".join(f"{package}/{x}" for x in nearest(name, names) or names)
         raise ValueError(
-            f"name must be a robot of {registry.module}, as {near}, got "
+            f"name must be a robot of {registry.where}, as {near}, got "
             f"{f'{package}/{name}'!r}."
         )
-    load: Callable[..., Any] = getattr(module, registry.load)
+    load: Callable[..., Any] = attrgetter(registry.load)(module)
     try:
         with _quiet(), jax.numpy_dtype_promotion("standard"):
             world = load(name, **registry.options)
+            env = from_brax(world, keep=registry.keep)
+            model = attrgetter(registry.model)(world)
     except Exception as error:  # of the package's, of any kind
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{registry.module} cannot make {name}: {reason}.") from error
-    env = from_brax(world, keep=registry.keep)
-    model = None  # of what is not MuJoCo, as Brax's `fast`
-    with contextlib.suppress(AttributeError):
-        model = attrgetter(registry.model)(world)
+        reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
+        raise ValueError(f"{registry.where} cannot make {name}: {reason}.") from error
 
     def qpos_fn(obs: Array) -> Array:
         # What is not asked for here is not computed.
@@ -139,6 +142,8 @@ def registered(package: str, name: str) -> Robot:
 
 
 def _own(place: int) -> RewardFn:
+    """Returns the task that is an entry of the observation."""
+
     def own(constants: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         del constants, obs, action
         return next_obs[..., place]
@@ -158,20 +163,26 @@ def _track(start: _Start, obs: Array, step_time: float) -> Array:
     """Returns positions `[T, Q]` of a trial.
 
     Where the root stands, which many leave out, is where its velocity has brought it.
+    The first that is observed, as a height, may be measured from elsewhere.
 
     Raises:
       ValueError: if no positions are found.
     """
     for missing in range(min(_MOST_MISSING, len(start.qpos) - 1) + 1):
         size = len(start.qpos) - missing
-        if np.array_equal(start.obs[:size], start.qpos[missing:]):
+        seen, there = np.asarray(start.obs[:size]), np.asarray(start.qpos[missing:])
+        if len(seen) < size:
+            continue
+        same = seen == there
+        if same[1:].all() and (same[0] or size > _FEW):
             break
     else:
         raise ValueError("its observation does not begin with positions.")
+    shift = there - seen
     root = jnp.broadcast_to(start.qpos[:missing], (len(obs), missing))
     if np.array_equal(start.obs[size : size + len(start.qvel)], start.qvel):
         root += step_time * jnp.cumsum(obs[:, size : size + missing], axis=0)
-    return jnp.concatenate([root, obs[:, :size]], axis=-1)
+    return jnp.concatenate([root, obs[:, :size] + shift], axis=-1)
 
 
 @contextlib.contextmanager
