@@ -18,11 +18,10 @@ import io
 import warnings
 from collections.abc import Callable, Generator, Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxpets._src.checks import nearest
@@ -117,19 +116,15 @@ def registered(package: str, name: str) -> Robot:
         with _quiet(), jax.numpy_dtype_promotion("standard"):
             world = load(name, **registry.options)
             env = from_brax(world, keep=registry.keep)
-            model = attrgetter(registry.model)(world)
+            model, step_time = attrgetter(registry.model, "dt")(world)
     except Exception as error:  # of the package's, of any kind
         reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
         raise ValueError(f"{registry.where} cannot make {name}: {reason}.") from error
 
     def qpos_fn(obs: Array) -> Array:
-        # What is not asked for here is not computed.
-        def start() -> _Start:
-            state = env.reset(jax.random.key(0))
-            return _Start(state.obs, *attrgetter(*registry.positions)(state.physics))
-
-        found = cast(_Start, jax.jit(start)())
-        return _track(found, obs, float(world.dt))
+        state = env.reset(jax.random.key(0))
+        positions = attrgetter(*registry.positions)(state.physics)
+        return _track(_Start(state.obs, *positions), obs, float(step_time))
 
     return Robot(
         name=f"{package}/{name}",
@@ -160,29 +155,28 @@ class _Start(NamedTuple):
 
 
 def _track(start: _Start, obs: Array, step_time: float) -> Array:
-    """Returns positions `[T, Q]` of a trial.
+    """Returns positions `[T, Q]` of a trial, NaN if its observation has none.
 
     Where the root stands, which many leave out, is where its velocity has brought it.
     The first that is observed, as a height, may be measured from elsewhere.
-
-    Raises:
-      ValueError: if no positions are found.
     """
-    for missing in range(min(_MOST_MISSING, len(start.qpos) - 1) + 1):
-        size = len(start.qpos) - missing
-        seen, there = np.asarray(start.obs[:size]), np.asarray(start.qpos[missing:])
+    num, num_speeds = len(start.qpos), len(start.qvel)
+    track = jnp.full((len(obs), num), jnp.nan)
+    for missing in reversed(range(min(num, _MOST_MISSING + 1))):
+        size = num - missing
+        seen, there = start.obs[:size], start.qpos[missing:]
         if len(seen) < size:
             continue
         same = seen == there
-        if same[1:].all() and (same[0] or size > _FEW):
-            break
-    else:
-        raise ValueError("its observation does not begin with positions.")
-    shift = there - seen
-    root = jnp.broadcast_to(start.qpos[:missing], (len(obs), missing))
-    if np.array_equal(start.obs[size : size + len(start.qvel)], start.qvel):
-        root += step_time * jnp.cumsum(obs[:, size : size + missing], axis=0)
-    return jnp.concatenate([root, obs[:, :size] + shift], axis=-1)
+        fits = jnp.all(same[1:]) & (same[0] | (size > _FEW))
+        root = jnp.broadcast_to(start.qpos[:missing], (len(obs), missing))
+        speeds = start.obs[size : size + num_speeds]
+        if len(speeds) == num_speeds:
+            way = step_time * jnp.cumsum(obs[:, size : size + missing], axis=0)
+            root += jnp.where(jnp.all(speeds == start.qvel), way, 0.0)
+        path = jnp.concatenate([root, obs[:, :size] + (there - seen)], axis=-1)
+        track = jnp.where(fits, path, track)
+    return track
 
 
 @contextlib.contextmanager

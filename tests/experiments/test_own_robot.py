@@ -130,6 +130,15 @@ def test_a_robot_without_a_model_is_not_drawn():
         video._opened(FILE, np.zeros((1, 4), np.float32), video.Look())
 
 
+def test_a_robot_that_hides_its_positions_is_not_drawn(monkeypatch):
+    robot = robots.named("pets/half_cheetah", "mujoco")
+    hidden = robot._replace(qpos_fn=lambda obs: obs + np.nan)
+    monkeypatch.setattr(robots, "named", lambda env, engine: hidden)
+    monkeypatch.setattr(video, "open_renderer", lambda *_: None)
+    with pytest.raises(UsageError, match="--env brax/pusher does not observe posi"):
+        video._opened("brax/pusher", np.zeros((1, 4), np.float32), video.Look())
+
+
 WRONG = {
     "def robot(backend:": "1: SyntaxError: ",
     "import os\n\nraise ValueError('far\\nout')": "3: ValueError: far.",

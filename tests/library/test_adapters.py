@@ -67,7 +67,7 @@ def test_a_robot_of_brax_seeks_the_reward_of_its_own(made):
     obs = jnp.arange(12.0).reshape(2, 6)
     earned = robot.tasks.reward_fn(robot.tasks.params[0], obs, jnp.zeros((2, 1)), obs)
     np.testing.assert_array_equal(earned, obs[:, 4])
-    np.testing.assert_array_equal(robot.qpos_fn(obs), obs[:, :2])
+    np.testing.assert_array_equal(jax.jit(robot.qpos_fn)(obs), obs[:, :2])
     last = robot.space.coordinates[3:]
     assert [(row.name, row.kind, row.is_input) for row in last] == [
         ("obs/3", "relative", True),
