@@ -166,8 +166,8 @@ def scorer(robot: Robot) -> Scorer:
 
         rewards = jax.vmap(reward, (0, None, None, None), -1)(every, *seen)
         if ends is not None:
-            ended = ends(seen.next_obs).astype(jnp.int32)
-            counts = jnp.cumsum(ended, axis=-1) == ended  # nothing ended before
+            count = _num_until_end(ends, seen.next_obs)[..., None]
+            counts = jnp.arange(rewards.shape[-2]) < count
             rewards = jnp.where(counts[..., None], rewards, 0.0)
         returns = jnp.sum(rewards, axis=-2)
         if angle is None:
@@ -175,8 +175,7 @@ def scorer(robot: Robot) -> Scorer:
         path = seen.next_obs[..., angle]
         last = path[..., -1]
         if ends is not None:
-            place = jnp.sum(counts, axis=-1, keepdims=True) - 1
-            last = jnp.take_along_axis(path, place, axis=-1)[..., 0]
+            last = jnp.take_along_axis(path, count - 1, axis=-1)[..., 0]
         return returns, (last - path[..., 0]) / (2 * jnp.pi)
 
     def per_trial(
@@ -189,6 +188,12 @@ def scorer(robot: Robot) -> Scorer:
         return program(seen, constants)
 
     return Scorer(tasks.names, jax.jit(per_trial))
+
+
+def _num_until_end(ends: Callable[[Array], Array], next_obs: Array) -> Array:
+    """Returns how many steps `[...]` of trials there are up to the first end."""
+    ended = ends(next_obs).astype(jnp.int32)
+    return jnp.sum(jnp.cumsum(ended, axis=-1) == ended, axis=-1, dtype=jnp.int32)
 
 
 def _actors(

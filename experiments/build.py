@@ -55,7 +55,7 @@ def build(config: Config) -> Parts:
     size = ensemble_config(config.model)
     trained = _ensemble(robot, size, jaxpets.Precision.TF32)
     arm = make_arm(config, _planned(config, robot), robot)
-    terminal_fn = env.terminal_fn and _imagined_end(env.terminal_fn)
+    terminal_fn = imagined_end(env)
     explored = config.num_trials * config.trial_length
     finetuned = config.finetune_trials * config.task_length
 
@@ -167,13 +167,6 @@ def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
     )
 
 
-def _imagined_end(
-    terminal_fn: Callable[[Array], Array],
-) -> Callable[[Any, Array], Array]:
-    """Returns what ends an imagined trial where a real one ends."""
-    return lambda params, obs: terminal_fn(obs)
-
-
 def _fitter(
     ensemble: jaxpets.Ensemble, training: TrainingConfig
 ) -> jaxpets.typing.Fitter:
@@ -219,6 +212,12 @@ def _rollout(
         model.sample, num_members=size.num_members, num_particles=search.num_particles
     )
     return rollout, SCAN
+
+
+def imagined_end(env: jaxpets.Env) -> Callable[[Any, Array], Array] | None:
+    """Returns what ends an imagined trial where a real one ends, if one ever does."""
+    ends = env.terminal_fn
+    return None if ends is None else lambda params, obs: ends(obs)
 
 
 def optimizer(
