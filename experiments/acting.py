@@ -43,11 +43,11 @@ class Trials(NamedTuple):
 
 
 class Score(NamedTuple):
-    """What trials were worth until they ended, which is where physics diverged, if so.
+    """What trials were worth until they ended, or physics diverged.
 
     returns: `[..., K]`.
     turns: `[...]`, or None for a robot of which none are counted.
-    num_steps: `[...]` int32, how many count.
+    num_steps: `[...]` int32, those before physics diverged.
     """
 
     returns: Array
@@ -124,6 +124,7 @@ def run(
     """
     reset_keys, act_keys = map(actors.place, split_keys(keys))
     state = actors.start(params.reward, reset_keys)
+    drawn = state.env.constants  # until a trial ends and another begins
     chunks = []
     for _ in range(num_chunks):
         state, transitions, values = actors.chunk(params, act_keys, state)
@@ -134,7 +135,7 @@ def run(
     transitions, values = jax.tree.map(
         lambda *parts: jnp.concatenate(parts, axis=time), *chunks
     )
-    return Trials(transitions, values, state.env.constants)
+    return Trials(transitions, values, drawn)
 
 
 def constants(robot: Robot, tasks: Any, keys: Array) -> Any:
@@ -161,8 +162,12 @@ def split_keys(keys: Array) -> tuple[Array, Array]:
 
 
 def scorer(robot: Robot) -> Scorer:
-    """Returns what scores trials of a robot; jitted once for all of a run."""
-    tasks, angle = robot.tasks, robot.angle
+    """Returns what scores trials of a robot; jitted once for all of a run.
+
+    What comes after the first end of a trial, from a new start, does not count, nor
+    what comes after physics diverged.
+    """
+    tasks, angle, ends = robot.tasks, robot.angle, robot.env.terminal_fn
     every = jax.tree.map(np.asarray, tasks.params)  # constants of the program
 
     def score(seen: jaxpets.Transition, constants: Any) -> Score:
@@ -171,7 +176,10 @@ def scorer(robot: Robot) -> Scorer:
             return tasks.reward_fn(params, obs, action, next_obs)
 
         rewards = jax.vmap(reward, (0, None, None, None), -1)(every, *seen)
-        count = jaxpets.datasets.num_stable(seen)[..., None]
+        num_steps = jaxpets.datasets.num_stable(seen)
+        count = num_steps[..., None]
+        if ends is not None:
+            count = jnp.minimum(count, _num_until_end(ends, seen.next_obs)[..., None])
         counts = jnp.arange(rewards.shape[-2]) < count
         returns = jnp.sum(jnp.where(counts[..., None], rewards, 0.0), axis=-2)
         turns = None
@@ -179,7 +187,7 @@ def scorer(robot: Robot) -> Scorer:
             path = seen.next_obs[..., angle]
             last = jnp.take_along_axis(path, jnp.maximum(count - 1, 0), axis=-1)
             turns = (last - path[..., :1])[..., 0] / (2 * jnp.pi)
-        return Score(returns, turns, count[..., 0])
+        return Score(returns, turns, num_steps)
 
     def per_trial(seen: jaxpets.Transition, constants: Any) -> Score:
         program = score
@@ -189,6 +197,12 @@ def scorer(robot: Robot) -> Scorer:
         return program(seen, constants)
 
     return Scorer(tasks.names, jax.jit(per_trial))
+
+
+def _num_until_end(ends: Callable[[Array], Array], next_obs: Array) -> Array:
+    """Returns how many steps `[...]` of trials there are up to the first end."""
+    ended = ends(next_obs).astype(jnp.int32)
+    return jnp.sum(jnp.cumsum(ended, axis=-1) == ended, axis=-1, dtype=jnp.int32)
 
 
 def _actors(

@@ -55,6 +55,7 @@ def build(config: Config) -> Parts:
     size = ensemble_config(config.model)
     trained = _ensemble(robot, size, jaxpets.Precision.TF32)
     arm = make_arm(config, _planned(config, robot), robot)
+    terminal_fn = imagined_end(env)
     explored = config.num_trials * config.trial_length
     finetuned = config.finetune_trials * config.task_length
 
@@ -64,7 +65,8 @@ def build(config: Config) -> Parts:
         rollout, kind = _rollout(robot, size, search)
         unroll = kind.startswith(KERNEL) and jax.default_backend() == "gpu"
         search_fn = optimizer(search, env, unroll)
-        return jaxpets.plan(rollout, reward_fn, search_fn), kind
+        planner = jaxpets.plan(rollout, reward_fn, search_fn, terminal_fn=terminal_fn)
+        return planner, kind
 
     reward = robot.tasks.reward_fn
     if config.pessimism:
@@ -210,6 +212,12 @@ def _rollout(
         model.sample, num_members=size.num_members, num_particles=search.num_particles
     )
     return rollout, SCAN
+
+
+def imagined_end(env: jaxpets.Env) -> Callable[[Any, Array], Array] | None:
+    """Returns what ends an imagined trial where a real one ends, if one ever does."""
+    ends = env.terminal_fn
+    return None if ends is None else lambda params, obs: ends(obs)
 
 
 def optimizer(

@@ -51,7 +51,7 @@ def named(env: str, engine: str, tasks: str | None = None) -> "Robot":
 
 
 def listing(engine: str) -> str:
-    """Returns a line per robot: name, sizes and tasks."""
+    """Returns a line per robot, with sizes and tasks, and one per package of more."""
     from jaxpets import envs
 
     lines = [("name", "observation", "action", "tasks")]
@@ -64,6 +64,8 @@ def listing(engine: str) -> str:
             continue
         seen, acted = map(str, sizes(robot))
         lines.append((name, seen, acted, ", ".join(robot.tasks.names)))
+    for package, module in envs.registries().items():
+        lines.append((f"{package}/NAME", "", "", f"own, of any NAME in {module}"))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)][:-1]
     return "\n".join(
         "  ".join([*(x.ljust(w) for x, w in zip(line, widths, strict=False)), line[-1]])

@@ -80,6 +80,7 @@ LAYERS = {
     "envs.tracks": 3,
     "envs.dmc_model": 1,
     "envs.recipe": 4,
+    "envs.registries": 3,
     "envs.dmc_rewards": 5,
     "envs.dmc_starts": 4,
     "envs.dmc": 6,

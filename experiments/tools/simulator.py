@@ -18,7 +18,7 @@ import tyro
 
 import jaxpets
 from experiments import acting, robots
-from experiments.build import optimizer
+from experiments.build import imagined_end, optimizer
 from experiments.config import EngineName, PlannerConfig
 from experiments.errors import RunError
 from experiments.presets import PRETRAINED_PLANNER
@@ -51,7 +51,12 @@ def perform(args: Arguments, robot: Robot) -> np.ndarray:
     """Returns the returns `[K, R]` of R trials of each of the K tasks."""
     tasks, score = robot.tasks, acting.scorer(robot).score
     search = optimizer(args.task_planner, robot.env)
-    planner = jaxpets.plan(env_rollout(robot.env), tasks.reward_fn, search)
+    planner = jaxpets.plan(
+        env_rollout(robot.env),
+        tasks.reward_fn,
+        search,
+        terminal_fn=imagined_end(robot.env),
+    )
 
     def trial(task: Any, key: jax.Array) -> jax.Array:
         env = acting.at_start(robot, task)

@@ -232,6 +232,7 @@ def _opened(env: str | None, obs: np.ndarray, look: Look) -> tuple[Draw, np.ndar
 
     It is called once ffmpeg runs, as JAX dislikes later forks.
     """
+    import jax
     import jax.numpy as jnp
 
     from experiments import robots
@@ -248,7 +249,10 @@ def _opened(env: str | None, obs: np.ndarray, look: Look) -> tuple[Draw, np.ndar
         reason = str(error).splitlines() or [type(error).__name__]
         print(f"error: {reason[0]}", file=sys.stderr)
         raise SystemExit(_NO_GL) from error
-    return draw, np.asarray(robot.qpos_fn(jnp.asarray(obs)))
+    positions = np.asarray(jax.jit(robot.qpos_fn)(jnp.asarray(obs)))
+    if not np.isfinite(positions).all():
+        raise UsageError(f"--env {env} does not observe positions to draw it by.")
+    return draw, positions
 
 
 def _gif_steps(args: argparse.Namespace, num_steps: int) -> range:

@@ -2,7 +2,7 @@
 
 from jaxpets.envs.adapters import env_rollout, from_brax
 from jaxpets.envs.mujoco_env import mujoco_env
-from jaxpets.envs.named import make, names
+from jaxpets.envs.named import make, names, registries
 from jaxpets.envs.robot import Axis, Robot, Tasks, tasks_of, with_constants
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "make",
     "mujoco_env",
     "names",
+    "registries",
     "tasks_of",
     "with_constants",
 ]

@@ -1,5 +1,6 @@
 """Bridges: environments of Brax come in, a simulator goes out as a planner's model."""
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import jax
@@ -7,7 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_key, check_record
-from jaxpets._src.types import Env, EnvState, RolloutFn
+from jaxpets._src.types import Coordinate, Env, EnvState, RolloutFn
+
+_KEPT = ("reward", "done")
 
 
 class BraxEnv(Protocol):
@@ -27,21 +30,33 @@ class BraxEnv(Protocol):
         ...
 
 
-def from_brax(env: BraxEnv) -> Env:
+def from_brax(env: BraxEnv, *, keep: Sequence[str] = ()) -> Env:
     """Adapts an environment of Brax or MuJoCo Playground with array observations.
 
-    Its reward is left behind, and so is `done`: planning here has no termination.
+    Its reward is of its own state, so what it earns and where it ends can be kept in
+    one way only: as entries of the observation, which a model learns to predict. A
+    planner's reward then reads `next_obs` at "reward":
+
+      env = from_brax(brax_env, keep=("reward", "done"))
+      place = coordinates.index(env.coordinates, "reward")
 
     Args:
       env: a single, unwrapped environment, for example
         `brax.envs.get_environment("inverted_pendulum")`.
+      keep: which of "reward" and "done" are observed behind what it observes itself,
+        in this order; no network reads them. With "done", which is 0 or 1, an Env has
+        a `terminal_fn`.
 
     Returns:
-      An Env whose `EnvState.physics` is the Brax state.
+      An Env whose `EnvState.physics` is the Brax state. If anything is kept it has
+      coordinates, of which the environment's own are called obs/0, obs/1 and so on,
+      with the change as what is predicted.
 
     Raises:
-      ValueError: if the observation is not a vector.
+      TypeError, ValueError: if `keep` has another word, or the observation is not a
+        vector.
     """
+    kept = _checked_keep(keep)
     one = jnp.ones((env.action_size,), jnp.float32)
 
     def wrap(state: Any) -> EnvState:
@@ -50,7 +65,9 @@ def from_brax(env: BraxEnv) -> Env:
             raise ValueError(f"env must observe one vector, got {shape}.")
         # Brax mixes weak types into its state, which would trace every step twice.
         state = jax.tree.map(_strong, state)
-        return EnvState(state.obs.astype(jnp.float32), state)
+        parts = [state.obs, *(getattr(state, name)[None] for name in kept)]
+        obs = jnp.concatenate([part.astype(jnp.float32) for part in parts])
+        return EnvState(obs, state)
 
     def reset(key: Array) -> EnvState:
         check_key("key", key)
@@ -61,7 +78,25 @@ def from_brax(env: BraxEnv) -> Env:
         with jax.numpy_dtype_promotion("standard"):
             return wrap(env.step(state.physics, action))
 
-    return Env(reset, step, action_low=-one, action_high=one)
+    adapted = Env(reset, step, action_low=-one, action_high=one)
+    if not kept:
+        return adapted
+    size = jax.eval_shape(lambda: reset(jax.random.key(0))).obs.shape[0] - len(kept)
+    rows = [Coordinate(f"obs/{i}") for i in range(size)]
+    rows += [Coordinate(name, "absolute", is_input=False) for name in kept]
+    adapted = adapted._replace(coordinates=tuple(rows))
+    return adapted._replace(terminal_fn=_is_done) if "done" in kept else adapted
+
+
+def _is_done(obs: Array) -> Array:
+    return obs[..., -1] > 0.5
+
+
+def _checked_keep(keep: Sequence[str]) -> list[str]:
+    """Returns what is kept in the order in which it is observed."""
+    if isinstance(keep, str) or not set(keep) <= set(_KEPT):
+        raise ValueError(f'keep must be among ("reward", "done"), got {keep!r}.')
+    return [name for name in _KEPT if name in keep]
 
 
 def _strong(x: Any) -> Array:

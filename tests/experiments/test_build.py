@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import pytest
 
 import jaxpets
-from experiments import cli
+from experiments import cli, robots
 from experiments.build import build
 from experiments.config import ArmName
+from jaxpets import envs
 from jaxpets.envs import half_cheetah
 
 
@@ -51,6 +52,23 @@ def test_an_arm_plans_with_its_data(arm):
     params = jaxpets.PlanParams(state.params, state.reward)
     plan, _ = jax.eval_shape(explorer.step, params, key, explorer.init(), jnp.zeros(18))
     assert plan.action.shape == (6,) and plan.value.shape == ()
+
+
+def test_imagined_trials_end_where_real_ones_do(monkeypatch):
+    robot = envs.make("pets/half_cheetah")
+    env = robot.env._replace(terminal_fn=lambda obs: obs[..., 0] > 1)
+    given = []
+
+    def plan(*parts, terminal_fn):
+        given.append(terminal_fn)
+
+    scan = ("--planner.no-fused", "--task-planner.no-fused")
+    config = cli.parse(["--phase", "explore", "--preset", "smoke", *scan])
+    monkeypatch.setattr(robots, "of", lambda config: robot._replace(env=env))
+    monkeypatch.setattr(jaxpets, "plan", plan)
+    build(config)
+    explores, performs = (end(None, jnp.array([0.0, 2.0])[:, None]) for end in given)
+    assert explores.tolist() == performs.tolist() == [False, True]
 
 
 def test_pessimism_lowers_what_a_plan_is_worth():

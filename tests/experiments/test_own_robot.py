@@ -130,6 +130,15 @@ def test_a_robot_without_a_model_is_not_drawn():
         video._opened(FILE, np.zeros((1, 4), np.float32), video.Look())
 
 
+def test_a_robot_that_hides_its_positions_is_not_drawn(monkeypatch):
+    robot = robots.named("pets/half_cheetah", "mujoco")
+    hidden = robot._replace(qpos_fn=lambda obs: obs + np.nan)
+    monkeypatch.setattr(robots, "named", lambda env, engine: hidden)
+    monkeypatch.setattr(video, "open_renderer", lambda *_: None)
+    with pytest.raises(UsageError, match="--env brax/pusher does not observe posi"):
+        video._opened("brax/pusher", np.zeros((1, 4), np.float32), video.Look())
+
+
 WRONG = {
     "def robot(backend:": "1: SyntaxError: ",
     "import os\n\nraise ValueError('far\\nout')": "3: ValueError: far.",
@@ -205,7 +214,9 @@ def test_robots_are_listed(capsys, monkeypatch):
     assert main(["--list", "envs"]) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert head.split() == ["name", "observation", "action", "tasks"]
-    assert [line.split()[0] for line in lines] == list(envs.names())
+    packages = ["brax/NAME", "playground/NAME"]
+    assert [line.split()[0] for line in lines] == [*some, *packages]
+    assert lines[-1].endswith("own, of any NAME in mujoco_playground.registry")
     assert "18" in lines[0] and lines[0].endswith("front-flip, back-flip")
     assert "stand, walk, run" in next(x for x in lines if x.startswith("dmc/walker"))
     assert main(["--list", "arms"]) == 2

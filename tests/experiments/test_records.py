@@ -11,6 +11,7 @@ from experiments import acting, records, robots
 from experiments.acting import Trials
 from experiments.records import describe
 from experiments.storage import metrics
+from jaxpets import envs
 from jaxpets.envs.half_cheetah import OBS_SIZE, TASK_NAMES
 
 
@@ -46,6 +47,22 @@ def test_plans_without_a_finite_candidate_are_counted():
     good, bad = records.rows(scorer, [{"phase": "explore"}] * 2, trials)
     assert "bad_plans" not in good and bad["bad_plans"] == 2
     assert describe([good, bad]).endswith("  bad plans: 2")
+
+
+def test_what_comes_after_the_end_of_a_trial_does_not_count():
+    """The second trial ends in its second step, and turns anew in another start."""
+    robot = robots.named("pets/half_cheetah", "mujoco")
+    place = robot.angle
+    robot = robot._replace(
+        env=robot.env._replace(terminal_fn=lambda obs: obs[..., 0] > 0),
+        tasks=envs.tasks_of({"one": lambda c, o, a, x: jnp.ones_like(x[..., 0])}),
+    )
+    angle = 2 * jnp.pi * jnp.array([[0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 7.0, 9.0]])
+    obs = jnp.zeros((2, 4, OBS_SIZE)).at[1, 1:3, 0].set(1.0).at[..., place].set(angle)
+    seen = jaxpets.Transition(obs, jnp.zeros((2, 4, 6)), obs)
+    returns, turns = acting.scorer(robot).score(seen, ())
+    np.testing.assert_array_equal(returns, [[4.0], [2.0]])
+    np.testing.assert_allclose(turns, [3.0, 1.0], rtol=1e-6)
 
 
 def test_updates_that_were_refused_are_counted():

@@ -1,4 +1,3 @@
-import warnings
 from types import SimpleNamespace
 
 import jax
@@ -8,37 +7,73 @@ import pytest
 import toys
 
 import jaxpets
-from jaxpets import PlanParams
+from jaxpets import PlanParams, envs
 from jaxpets.envs import env_rollout, from_brax
 
 
 @pytest.fixture(scope="module")
-def pendulum():
-    """A real environment of Brax, and the same as an Env."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Brax recommends MJX
-        import brax.envs
+def made():
+    """A real environment of Brax, and the robot that it is here."""
+    import brax.envs
 
-        brax_env = brax.envs.get_environment("inverted_pendulum")
-    return brax_env, from_brax(brax_env)
+    load, loaded = brax.envs.get_environment, []
+
+    def noted(name):
+        loaded.append(load(name))
+        return loaded[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(brax.envs, "get_environment", noted)
+        return envs.make("brax/inverted_pendulum"), *loaded
+
+
+@pytest.fixture
+def pendulum(made):
+    robot, brax_env = made
+    return brax_env, robot.env
 
 
 def test_from_brax_steps_as_brax_does(pendulum, key):
+    """And earns and ends as there: the pole falls on the way."""
     brax_env, env = pendulum
+
+    def seen(state):
+        own = [state.reward, state.done]
+        return [*state.obs.tolist(), *map(float, own)]
+
     # Brax itself does not trace under strict promotion.
     with jax.numpy_dtype_promotion("standard"):
         state = jax.jit(env.reset)(key)
         want = jax.jit(brax_env.reset)(jax.random.key_data(key))
-        np.testing.assert_allclose(state.obs, want.obs, rtol=1e-6)
+        np.testing.assert_allclose(state.obs, seen(want), rtol=1e-6)
         brax_step = jax.jit(brax_env.step)
         env_step = jax.jit(env.step)
-        for i in range(5):
-            action = jnp.full((1,), 0.2 * i - 0.5)
+        for _ in range(20):
+            action = jnp.full((1,), 0.3)
             state, want = env_step(state, action), brax_step(want, action)
-            np.testing.assert_allclose(state.obs, want.obs, rtol=1e-5, atol=1e-6)
-    assert state.obs.dtype == jnp.float32 and state.obs.shape == (4,)
+            np.testing.assert_allclose(state.obs, seen(want), rtol=1e-5, atol=1e-6)
+            assert env.terminal_fn(state.obs) == want.done
+            if want.done:
+                break
+    assert want.done and state.obs.dtype == jnp.float32 and state.obs.shape == (6,)
     np.testing.assert_array_equal(env.action_high, np.ones(1))
     np.testing.assert_array_equal(env.action_low, -np.ones(1))
+
+
+def test_a_robot_of_brax_seeks_the_reward_of_its_own(made):
+    robot, _ = made
+    assert robot.name == "brax/inverted_pendulum" and robot.model.nq == 2
+    assert robot.tasks.names == ("own",)
+    obs = jnp.arange(12.0).reshape(2, 6)
+    earned = robot.tasks.reward_fn(robot.tasks.params[0], obs, jnp.zeros((2, 1)), obs)
+    np.testing.assert_array_equal(earned, obs[:, 4])
+    np.testing.assert_array_equal(jax.jit(robot.qpos_fn)(obs), obs[:, :2])
+    last = robot.space.coordinates[3:]
+    assert [(row.name, row.kind, row.is_input) for row in last] == [
+        ("obs/3", "relative", True),
+        ("reward", "absolute", False),
+        ("done", "absolute", False),
+    ]
 
 
 def test_from_brax_keeps_its_avals(pendulum, key):
@@ -82,6 +117,13 @@ def test_from_brax_runs_in_our_planner(pendulum, key):
     with jax.numpy_dtype_promotion("standard"):
         angle = jax.jit(episode)(key)[:, 1]
     assert jnp.abs(angle).max() < 0.2  # rad; Brax calls more a fall
+
+
+@pytest.mark.parametrize("keep", ["done", ("reward", "cost")])
+def test_from_brax_keeps_no_more_than_there_is(keep):
+    fake = SimpleNamespace(action_size=1)
+    with pytest.raises(ValueError, match=r'keep must be among .*"done".*, got '):
+        from_brax(fake, keep=keep)
 
 
 def test_from_brax_refuses_observations_that_are_no_vector(key):
