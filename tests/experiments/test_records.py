@@ -60,9 +60,10 @@ def test_what_comes_after_the_end_of_a_trial_does_not_count():
     angle = 2 * jnp.pi * jnp.array([[0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 7.0, 9.0]])
     obs = jnp.zeros((2, 4, OBS_SIZE)).at[1, 1:3, 0].set(1.0).at[..., place].set(angle)
     seen = jaxpets.Transition(obs, jnp.zeros((2, 4, 6)), obs)
-    returns, turns = acting.scorer(robot).score(seen, ())
-    np.testing.assert_array_equal(returns, [[4.0], [2.0]])
-    np.testing.assert_allclose(turns, [3.0, 1.0], rtol=1e-6)
+    score = acting.scorer(robot).score(seen, ())
+    np.testing.assert_array_equal(score.returns, [[4.0], [2.0]])
+    np.testing.assert_allclose(score.turns, [3.0, 1.0], rtol=1e-6)
+    np.testing.assert_array_equal(score.num_steps, [4, 4])  # physics is well
 
 
 def test_updates_that_were_refused_are_counted():
