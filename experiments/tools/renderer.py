@@ -11,7 +11,7 @@ class Look(NamedTuple):
 
     width: int = 640
     height: int = 360
-    fps: int = 20  # the environment's steps a second: real time
+    fps: int = 20  # steps of the environment a second of video
 
 
 Draw = Callable[[np.ndarray], np.ndarray]  # qpos [Q] -> picture [height, width, 3]

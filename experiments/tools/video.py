@@ -16,12 +16,16 @@ import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments.errors import RunError, UsageError
 from experiments.storage import disk
 from experiments.tools.renderer import Draw, Look, open_renderer
+
+if TYPE_CHECKING:  # it brings mujoco, which may find no OpenGL
+    from jaxpets.envs import Robot
 
 _NO_GL = 69  # exit code of the child where OpenGL does not work; EX_UNAVAILABLE
 _BACKENDS = ("egl", "osmesa")
@@ -32,10 +36,8 @@ _GL_HINT = (
 _SIZE_RANGE = range(64, 4097)
 _FPS_RANGE = range(1, 121)
 
-# A GIF is for a page: a small cut with few colours.
-_GIF_WIDTH = 280
-_GIF_COLORS = 48
-_GIF_SKIP = 2  # every second frame
+# A GIF is for a page: a small cut with few colours, and every second frame.
+_GIF_WIDTH, _GIF_COLORS, _GIF_SKIP = 280, 48, 2
 
 
 def render(
@@ -76,8 +78,8 @@ def render(
 
 def _child_env(backend: str) -> dict[str, str]:
     """Returns the environment in which a child renders and leaves the GPU to JAX."""
-    here = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+    here = Path(__file__).resolve().parents[2]
+    path = os.pathsep.join(filter(None, [str(here), os.environ.get("PYTHONPATH")]))
     own = {"MUJOCO_GL": backend, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
     return os.environ | own
 
@@ -177,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--task", required=True, help="for example forward")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--trial", type=int, default=1, help="counted from 1")
-    parser.add_argument("--fps", type=int, default=Look().fps, help="20 is real time")
+    parser.add_argument("--fps", type=int, help="by default real time")
     parser.add_argument("--width", type=int, default=Look().width)
     parser.add_argument("--height", type=int, default=Look().height)
     parser.add_argument("--gif", action="store_true", help="also write a short .gif")
@@ -192,7 +194,7 @@ def _check(args: argparse.Namespace) -> None:
     ranges = {"width": _SIZE_RANGE, "height": _SIZE_RANGE, "fps": _FPS_RANGE}
     for name, valid in ranges.items():
         value = getattr(args, name)
-        if value not in valid:
+        if value is not None and value not in valid:
             raise UsageError(
                 f"--{name} {value}: from {valid.start} to {valid.stop - 1}"
             )
@@ -207,12 +209,15 @@ def _check(args: argparse.Namespace) -> None:
 def _render_here(args: argparse.Namespace) -> None:
     _check(args)
     obs = load_trial(args.npz, task=args.task, seed=args.seed, trial=args.trial)
+    robot = _robot(args.env)
+    if args.fps is None:
+        args.fps = min(round(1 / robot.step_time), _FPS_RANGE.stop - 1)
     look = Look(args.width, args.height, args.fps)
     wanted = _gif_steps(args, len(obs))
     cut: list[np.ndarray] = []
 
     def pictures() -> Iterator[np.ndarray]:
-        draw, positions = _opened(args.env, obs, look)
+        draw, positions = _opened(robot, obs, look)
         for step, qpos in enumerate(positions):
             picture = draw(qpos)
             if step in wanted:
@@ -227,32 +232,42 @@ def _render_here(args: argparse.Namespace) -> None:
             write_gif(draft, cut, fps=args.fps / _GIF_SKIP)
 
 
-def _opened(env: str | None, obs: np.ndarray, look: Look) -> tuple[Draw, np.ndarray]:
-    """Returns what draws a robot and where it was, qpos `[T, Q]`.
+def _robot(env: str | None) -> "Robot":
+    """Returns the robot that is drawn."""
+    try:
+        from experiments import robots
+        from experiments.storage.rundir import HALF_CHEETAH
 
-    It is called once ffmpeg runs, as JAX dislikes later forks.
-    """
+        robot = robots.named(env or HALF_CHEETAH, "mujoco")
+    except RunError:
+        raise
+    except Exception as error:  # importing MuJoCo with an OpenGL that is none
+        raise _no_gl(error) from error
+    if robot.model is None or robot.qpos_fn is None:
+        raise UsageError(f"--env {env} has no model that can be drawn.")
+    return robot
+
+
+def _opened(robot: "Robot", obs: np.ndarray, look: Look) -> tuple[Draw, np.ndarray]:
+    """Returns what draws a robot and where it was, qpos `[T, Q]`."""
     import jax
     import jax.numpy as jnp
 
-    from experiments import robots
-    from experiments.storage.rundir import HALF_CHEETAH
-
+    assert robot.qpos_fn
     try:
-        robot = robots.named(env or HALF_CHEETAH, "mujoco")
-        if robot.model is None or robot.qpos_fn is None:
-            raise UsageError(f"--env {env} has no model that can be drawn.")
         draw = open_renderer(robot.model, look, robot.camera)
-    except RunError:
-        raise
     except Exception as error:  # ImportError, RuntimeError, AttributeError, ...
-        reason = str(error).splitlines() or [type(error).__name__]
-        print(f"error: {reason[0]}", file=sys.stderr)
-        raise SystemExit(_NO_GL) from error
+        raise _no_gl(error) from error
     positions = np.asarray(jax.jit(robot.qpos_fn)(jnp.asarray(obs)))
     if not np.isfinite(positions).all():
-        raise UsageError(f"--env {env} does not observe positions to draw it by.")
+        raise UsageError(f"{robot.name} does not observe positions to draw it by.")
     return draw, positions
+
+
+def _no_gl(error: Exception) -> SystemExit:
+    reason = str(error).splitlines() or [type(error).__name__]
+    print("error:", reason[0], file=sys.stderr)
+    return SystemExit(_NO_GL)
 
 
 def _gif_steps(args: argparse.Namespace, num_steps: int) -> range:

@@ -73,6 +73,7 @@ def _half_cheetah(backend: str) -> Robot:
         model=half_cheetah.load_model(),
         qpos_fn=half_cheetah.qpos_from_obs,
         camera="track",
+        step_time=half_cheetah.TIMESTEP,
     )
 
 

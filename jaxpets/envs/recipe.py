@@ -85,6 +85,7 @@ def build(name: str, model: Any, recipe: Recipe, backend: str = "mujoco") -> Rob
     found = recipe.rewards(model, lambda entry: index(rows, entry))
     elsewhere = [(env_of(start), tasks) for start, tasks in recipe.task_starts]
     first, second = (_axis(rows, *axis) for axis in recipe.axes)
+    step_time = recipe.control_step * recipe.action_repeat
     return Robot(
         name=name,
         env=env,
@@ -95,10 +96,11 @@ def build(name: str, model: Any, recipe: Recipe, backend: str = "mujoco") -> Rob
         axes=(first, second),
         angle=index(rows, recipe.angle) if recipe.angle else None,
         model=model,
-        qpos_fn=qpos_fn(model, rows, recipe.control_step * recipe.action_repeat),
+        qpos_fn=qpos_fn(model, rows, step_time),
         camera=recipe.camera,
         task_reset=_task_reset(env, tuple(found), elsewhere) if elsewhere else None,
         action_repeat=recipe.action_repeat,
+        step_time=step_time,
     )
 
 

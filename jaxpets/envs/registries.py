@@ -133,6 +133,7 @@ def registered(package: str, name: str) -> Robot:
         tasks=tasks_of({"own": _own(index(env.coordinates, "reward"))}),
         model=model,
         qpos_fn=qpos_fn,
+        step_time=float(step_time),
     )
 
 

@@ -73,6 +73,7 @@ class Robot(NamedTuple):
         start; None if all of them start as `env.reset` does.
       action_repeat: control steps of the original in a step of `env`: what is known by
         its return over 1,000 control steps is tried for 1,000 over this.
+      step_time: of a step of `env`, in s; videos are in real time by it.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Robot(NamedTuple):
     camera: str | None = None
     task_reset: Callable[[Any, Array], EnvState] | None = None
     action_repeat: int = 1
+    step_time: float = 0.05
 
 
 def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:

@@ -1,7 +1,6 @@
 """What tests/test_devices.py needs several devices for; prints what it saw as JSON.
 
-Arguments: a folder for runs, a run of one seed on one device, and one of four seeds on
-one device which lacks its last trial.
+Arguments: a folder for runs, and a run of one seed on one device.
 """
 
 import json
@@ -90,12 +89,11 @@ def one_plan():
     }
 
 
-def report(out, one_seed, unfinished):
+def report(out, one_seed):
     explored = ["--phase", "explore", "--preset", "smoke", "--engine", "mujoco"]
     four = [*explored, "--seeds", "0", "1", "2", "3", "--out"]
     codes = [
         main([*four, str(out / "four")]),
-        main([*four, str(unfinished.parent)]),
         main(["--phase", "zero-shot", "--from", str(one_seed), *runs.REFIT]),
     ]
     spread_over, said = acting_program([*four, str(out / "four")])

@@ -127,16 +127,15 @@ def test_a_tool_runs_no_file_that_only_a_run_names(out, tmp_path, capsys):
 
 def test_a_robot_without_a_model_is_not_drawn():
     with pytest.raises(UsageError, match=f"{FILE} has no model that can be drawn"):
-        video._opened(FILE, np.zeros((1, 4), np.float32), video.Look())
+        video._robot(FILE)
 
 
 def test_a_robot_that_hides_its_positions_is_not_drawn(monkeypatch):
     robot = robots.named("pets/half_cheetah", "mujoco")
     hidden = robot._replace(qpos_fn=lambda obs: obs + np.nan)
-    monkeypatch.setattr(robots, "named", lambda env, engine: hidden)
     monkeypatch.setattr(video, "open_renderer", lambda *_: None)
-    with pytest.raises(UsageError, match="--env brax/pusher does not observe posi"):
-        video._opened("brax/pusher", np.zeros((1, 4), np.float32), video.Look())
+    with pytest.raises(UsageError, match="pets/half_cheetah does not observe posi"):
+        video._opened(hidden, np.zeros((1, 4), np.float32), video.Look())
 
 
 WRONG = {

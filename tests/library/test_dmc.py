@@ -75,6 +75,7 @@ def test_the_cheetah_settles_as_dm_controls_does():
 
 def test_cartpole_balances_from_upright_and_swings_up_from_below():
     robot, key = make("cartpole"), parity.start_keys(TRIALS)[0]
+    assert robot.step_time == 0.04 and robot.action_repeat == 4
     states = jax.jit(jax.vmap(lambda task: robot.task_reset(task, key)))(
         robot.tasks.params
     )
