@@ -87,11 +87,8 @@ def trajectories(
     scored = scorer.score(transitions, trials.constants)
     columns = [scorer.names.index(task) for task in tasks]
     own = [np.asarray(scored.returns)[:, k, :, c] for k, c in enumerate(columns)]
-    path = np.array(transitions.next_obs)
-    ends = np.asarray(scored.num_steps)[..., None]
-    path[np.arange(path.shape[-2]) >= ends] = np.nan
     return {
-        "obs": path,
+        "obs": _nan_from(np.asarray(scored.num_steps), transitions.next_obs),
         "action": np.asarray(transitions.action),
         "seeds": np.asarray(seeds),
         "tasks": np.asarray(tasks),
@@ -107,11 +104,18 @@ def until_diverged(seen: jaxpets.Transition, lost: Sequence[int]) -> jaxpets.Tra
       seen: `[..., T, *]`.
       lost: steps of every trial, as the log has them; of none if it has lost them.
     """
-    path = np.array(seen.next_obs)
-    if len(lost) == math.prod(path.shape[:-2]):
-        ends = path.shape[-2] - np.reshape(lost, path.shape[:-2])
-        path[np.arange(path.shape[-2]) >= ends[..., None]] = np.nan
-    return seen._replace(next_obs=path)
+    *trials, length, _ = seen.next_obs.shape
+    if len(lost) != math.prod(trials):
+        return seen
+    ends = length - np.reshape(lost, trials)
+    return seen._replace(next_obs=_nan_from(ends, seen.next_obs))
+
+
+def _nan_from(ends: np.ndarray, path: Any) -> np.ndarray:
+    """Returns observations `[..., T, D]`, NaN from a step `[...]` on."""
+    path = np.array(path)
+    path[np.arange(path.shape[-2]) >= ends[..., None]] = np.nan
+    return path
 
 
 def describe(rows: Sequence[dict[str, Any]]) -> str:
