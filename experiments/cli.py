@@ -106,9 +106,9 @@ def _phase(argv: Sequence[str]) -> tuple[Phase, list[str]]:
 
 
 def _preset(argv: Sequence[str]) -> Config:
-    """Returns the numbers of the preset and arm that a command line names."""
+    """Returns the numbers of the preset, arm and robot that a command line names."""
     basics, _ = flags.of(Basics, argv, Basics())
-    return preset_config(basics.preset, basics.arm)
+    return preset_config(basics.preset, basics.arm, basics.env)
 
 
 def _config(phase: Phase, argv: Sequence[str], default: Config) -> Config:
@@ -146,10 +146,10 @@ def _explored(config: Config) -> Config:
             "name a run with --from."
         )
     data = rundir.read_json(path)
-    # What an older version did not write is that of the run's preset and arm, not of
-    # those that happen to be said again.
+    # What an older version did not write is that of the run's own preset, arm and
+    # robot, not of those that happen to be said again.
     own = from_json(data, config, str(path))
-    explored = from_json(data, preset_config(own.preset, own.arm), str(path))
+    explored = from_json(data, preset_config(own.preset, own.arm, own.env), str(path))
     for entry in ("env", "arm"):
         said, found = getattr(config, entry), getattr(explored, entry)
         user_files.check_named(flag(entry), said, found, path)

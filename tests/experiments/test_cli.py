@@ -313,6 +313,22 @@ def test_best_is_the_paper_with_another_refit_and_search_for_tasks():
     assert laptop.task_planner == PRESETS["laptop"].task_planner
 
 
+def test_a_robot_brings_numbers_of_its_own_to_the_laptop():
+    flags = ["--phase", "explore", "--env", "dmc/cartpole"]
+    cartpole, laptop = cli.parse(flags), PRESETS["laptop"]
+    assert (cartpole.engine, cartpole.num_trials, cartpole.trial_length) == (
+        "mujoco", 16, 250,
+    )  # fmt: skip
+    assert cartpole.planner == dataclasses.replace(laptop.planner, horizon=25)
+    assert cartpole.model == laptop.model
+    flags += ["--num-trials", "3", "--engine", "mjx"]
+    assert (cli.parse(flags).num_trials, cli.parse(flags).engine) == (3, "mjx")
+    paper = cli.parse(
+        ["--phase", "explore", "--env", "dmc/cartpole", "--preset", "paper"]
+    )
+    assert paper.num_trials == 60
+
+
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [

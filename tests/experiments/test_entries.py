@@ -11,6 +11,7 @@ from experiments.config import Config, Run, part
 from experiments.entries import differences, entries, from_json, to_json
 from experiments.errors import CheckpointError
 from experiments.presets import PRESETS, preset_config
+from experiments.storage.rundir import HALF_CHEETAH
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -111,7 +112,8 @@ def test_all_configs_that_were_ever_committed_can_be_read():
     assert len(paths) >= 4
     for path in paths:
         data = json.loads(path.read_text())
-        config = from_json(data, preset_config(data["preset"], data["arm"]))
+        env = data.get("env", HALF_CHEETAH)
+        config = from_json(data, preset_config(data["preset"], data["arm"], env))
         assert {**to_json(config), **data}.keys() == to_json(config).keys(), path
         config = from_json(data, Config())
         assert differences(data, to_json(config)) == [], path
