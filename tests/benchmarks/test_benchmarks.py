@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import all as all_benchmarks
 from benchmarks import (
+    agent,
     env,
     fit,
     model_quality,
@@ -23,6 +23,7 @@ from benchmarks import (
     trial,
     workloads,
 )
+from benchmarks import all as all_benchmarks
 from benchmarks import rows as rows_module
 
 ENVIRONMENT = {"benchmark", "date", "device", "cpus", "versions", "sizes"}
@@ -140,6 +141,16 @@ def test_ratios(tmp_path):
     for row in found:
         assert set(row) == ENVIRONMENT | results
         assert all(row[name] > 0 for name in results)
+
+
+def test_agent(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    flags = ["--engine", "scan", "--optimizer", "cem", "--repeats", "3", "--json"]
+    (row,) = agent.main(["--tiny", *flags, str(path)])
+    assert json.loads(path.read_text()) == json.loads(json.dumps(row))
+    assert 0 < row["plan_ms"] <= row["plan_p99_ms"]
+    assert 0 < row["act_ms"] <= row["act_p99_ms"]
+    assert abs(row["added_ms"]) < row["act_p99_ms"]
 
 
 def test_rollout_and_fit(tmp_path):
