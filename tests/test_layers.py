@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import jaxpets
-from jaxpets import coordinates, models
+from jaxpets import coordinates, formulas, models
 
 PACKAGE = Path(jaxpets.__file__).parent
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -57,6 +57,9 @@ LAYERS = {
     "_src.ensemble_params": 3,
     "_src.ensemble": 4,
     "_src.fitter": 5,
+    "_src.formula": 1,
+    "_src.formula_program": 2,
+    "_src.formula_text": 3,
     "_src.fused_rollout": 5,
     "_src.model_file": 5,
     "_src.pretrained": 6,
@@ -91,6 +94,7 @@ LAYERS = {
     "envs": 8,
     "coordinates": 9,
     "datasets": 9,
+    "formulas": 9,
     "models": 9,
     "optimizers": 9,
     "rewards": 9,
@@ -102,6 +106,7 @@ MODULES_OF_NAMES = [
     jaxpets,
     coordinates,
     jaxpets.datasets,
+    formulas,
     models,
     jaxpets.optimizers,
     jaxpets.rewards,

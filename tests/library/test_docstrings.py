@@ -6,12 +6,13 @@ import re
 import pytest
 
 import jaxpets
-from jaxpets import coordinates, models
+from jaxpets import coordinates, formulas, models
 
 MODULES = [
     jaxpets,
     coordinates,
     jaxpets.datasets,
+    formulas,
     models,
     jaxpets.optimizers,
     jaxpets.rewards,
