@@ -4,6 +4,7 @@ import ast
 import itertools
 import keyword
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
@@ -147,7 +148,8 @@ def _tree(text: str) -> ast.expr:
     if start == len(line):
         raise FormulaError("A formula is wanted, as -(velocity - 2)**2.", 0)
     try:
-        tree = ast.parse(line[start:], mode="eval").body
+        with warnings.catch_warnings(action="ignore"):
+            tree = ast.parse(line[start:], mode="eval").body
     except SyntaxError as error:
         column = start + error.offset - 1 if error.offset else len(text)
         message = f"This cannot be read: {error.msg}."

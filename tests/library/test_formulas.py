@@ -225,6 +225,12 @@ def test_any_text_is_a_formula_or_an_error_with_a_place(text):
         assert 0 < int(formula.size) <= 64
 
 
+@pytest.mark.filterwarnings("error")
+def test_pythons_own_warnings_are_not_shown():
+    with pytest.raises(formulas.FormulaError, match="cannot be read"):
+        formulas.parse("1if height", {"height": 0})
+
+
 def test_entries_have_words():
     rows = [
         Coordinate(name)
