@@ -2,7 +2,7 @@
 
 As a script it does so at length, and prints the largest differences:
 
-    PYTHONPATH=.:tests/library python tests/library/gym_judge.py [name ...]
+    PYTHONPATH=.:tests/library python tests/library/gym_judge.py [mjx] [name ...]
 """
 
 import sys
@@ -67,19 +67,21 @@ class Judge:
         return env._get_rew(velocity, action)[0] + env.contact_cost
 
 
-def differences(name, num_trials, num_steps):
+def differences(name, num_trials, num_steps, backend="mujoco"):
     """Returns how far a robot of ours is from gymnasium's, both, and the trials."""
     # Rewards are laid beside each other at every control step.
     recipe = gym.ROBOTS[name]._replace(action_repeat=1)
-    robot = build(f"gym/{name}", gym._model(recipe.file), recipe)
+    robot = build(f"gym/{name}", gym._model(recipe.file), recipe, backend)
     trials = parity.rolled(robot, num_trials, num_steps)
     return parity.differences(robot, Judge(name), trials), robot, trials
 
 
 def main(argv):
-    for name in argv or gym.ROBOTS:
-        long, _, _ = differences(name, 1, 1000)
-        wide, _, _ = differences(name, 500, 2)
+    backend = "mjx" if "mjx" in argv else "mujoco"
+    many = 1000 if backend == "mujoco" else 40
+    for name in [name for name in argv if name != "mjx"] or gym.ROBOTS:
+        long, _, _ = differences(name, 1, many, backend)
+        wide, _, _ = differences(name, many // 2, 2, backend)
         print(name, long, wide, sep="\n  ", flush=True)
 
 
