@@ -25,10 +25,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row."""
     size = workloads.chosen_size(args)
     planner = workloads.planner(size, "f32", args.optimizer, engine=args.engine)
-    act, plan = calls(size, planner)
-    for warm in (act, plan):
-        warm()
-    pairs = [(timing.seconds(act), timing.seconds(plan)) for _ in range(args.repeats)]
+    pairs = timing.in_turn(*calls(size, planner), repeats=args.repeats)
     acts, plans = 1e3 * np.asarray(pairs).T
     yield rows.make_row(
         "agent",

@@ -56,13 +56,24 @@ def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:
     return repeat(lambda: compiled(*args), compile_s, repeats=repeats)
 
 
+def in_turn(
+    first: Callable[[], Any], second: Callable[[], Any], *, repeats: int
+) -> list[tuple[float, float]]:
+    """Runs two callables in turn, so that both see the same state of the machine.
+
+    Returns:
+      The seconds of both, `repeats` times, after one run of each that does not count.
+    """
+    seconds(first)
+    seconds(second)
+    return [(seconds(first), seconds(second)) for _ in range(repeats)]
+
+
 def compare(
     first: Callable[[], Any], second: Callable[[], Any], *, repeats: int
 ) -> Ratio:
-    """Runs two callables in turn, so that both see the same state of the machine."""
-    seconds(first)
-    seconds(second)
-    pairs = [(seconds(first), seconds(second)) for _ in range(repeats)]
+    """Returns how long two callables take that run in turn."""
+    pairs = in_turn(first, second, repeats=repeats)
     return Ratio(
         first_ms=1e3 * statistics.median(pair[0] for pair in pairs),
         second_ms=1e3 * statistics.median(pair[1] for pair in pairs),

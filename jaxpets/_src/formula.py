@@ -70,10 +70,6 @@ def _where(condition: Array, x: Array, y: Array) -> Array:
     return jnp.where(condition != 0.0, x, y)
 
 
-def _clip(x: Array, low: Array, high: Array) -> Array:
-    return jnp.minimum(jnp.maximum(x, low), high)
-
-
 LOADS = ("constant", "action", "effort")
 """The operations that read no register; their opcodes are the first."""
 
@@ -104,7 +100,7 @@ OPERATIONS: dict[str, tuple[int, Callable[..., Array]]] = {
     "and": (2, _is(jnp.logical_and)),
     "or": (2, _is(jnp.logical_or)),
     "where": (3, _where),
-    "clip": (3, _clip),
+    "clip": (3, jnp.clip),
     "tolerance": (4, _tolerance),
 }
 
