@@ -11,9 +11,10 @@ from jax import Array
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
-from experiments.parallel import devices
-from experiments.parallel.devices import AXES, SEED, TASK, Placement
 from jaxpets.envs import Robot, with_constants
+
+from .parallel import devices
+from .parallel.devices import AXES, SEED, TASK, Placement
 
 # Called between chunks with the environment steps done; may raise to stop the run.
 Tick = Callable[[int], None]

@@ -9,11 +9,12 @@ import optax
 from jax import Array
 
 import jaxpets
-from experiments import user_files
-from experiments.acting import Bind
-from experiments.config import Config
 from jaxpets import rewards
 from jaxpets.envs import Robot, with_constants
+
+from . import user_files
+from .acting import Bind
+from .config import Config
 
 # States that an imagined one is compared with, as many as in a batch of APT; the time
 # of a plan grows with it.

@@ -11,17 +11,18 @@ import optax
 from jax import Array
 
 import jaxpets
-from experiments import robots
-from experiments.acting import Bind
-from experiments.arms import Arm, make_arm
-from experiments.config import (
+from jaxpets.envs import Robot
+
+from . import robots
+from .acting import Bind
+from .arms import Arm, make_arm
+from .config import (
     Config,
     ModelConfig,
     PlannerConfig,
     TrainingConfig,
     part,
 )
-from jaxpets.envs import Robot
 
 State = jaxpets.typing.LearnerState
 KERNEL, SCAN = "kernel", "scan"

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from experiments import flags, robots, user_files
-from experiments.config import (
+from . import flags, robots, user_files
+from .config import (
     Basics,
     Compute,
     Config,
@@ -16,12 +16,12 @@ from experiments.config import (
     Science,
     part,
 )
-from experiments.entries import flag, from_json
-from experiments.errors import CheckpointError, UsageError
-from experiments.parallel.distributed import ProcessSpec
-from experiments.presets import preset_config
-from experiments.storage import rundir
-from experiments.validate import (
+from .entries import flag, from_json
+from .errors import CheckpointError, UsageError
+from .parallel.distributed import ProcessSpec
+from .presets import preset_config
+from .storage import rundir
+from .validate import (
     check_explored,
     check_names,
     check_process,
@@ -55,7 +55,7 @@ def parse(argv: Sequence[str]) -> Config:
     if phase != "report":
         robots.check_tasks(config, robots.of(config))
         if user_files.is_file(config.arm):
-            from experiments import build
+            from . import build
 
             build.check_arm(config)
     return config

@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 from msgspec import Meta
 
-from experiments.storage.rundir import HALF_CHEETAH
 from jaxpets import EnsembleConfig, FitConfig
+
+from .storage.rundir import HALF_CHEETAH
 
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
 Preset = Literal["laptop", "paper", "smoke"]

@@ -3,9 +3,9 @@
 import itertools
 from collections.abc import Sequence
 
-from experiments import robots
-from experiments.config import UNPLANNED, Config, PlannerConfig
-from experiments.errors import UsageError
+from . import robots
+from .config import UNPLANNED, Config, PlannerConfig
+from .errors import UsageError
 
 # Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
 _CPU_FLOPS_AN_HOUR = 1e11 * 3600

@@ -24,8 +24,8 @@ from typing import (
 
 import msgspec
 
-from experiments.config import Config, Mark, Run
-from experiments.errors import CheckpointError
+from .config import Config, Mark, Run
+from .errors import CheckpointError
 
 T = TypeVar("T")
 # Makes an error of an entry's name, what it is and what it must be; None: not there.

@@ -8,13 +8,14 @@ from typing import Any
 import jax
 
 import jaxpets
-from experiments import user_files
-from experiments.build import EXPLORE, Parts, State, build, trial_keys
-from experiments.config import Config
-from experiments.entries import from_json
-from experiments.presets import PRESETS
-from experiments.storage import rundir
-from experiments.storage.folder import RunFolder
+
+from . import user_files
+from .build import EXPLORE, Parts, State, build, trial_keys
+from .config import Config
+from .entries import from_json
+from .presets import PRESETS
+from .storage import rundir
+from .storage.folder import RunFolder
 
 
 def config_of(run: RunFolder) -> Config:

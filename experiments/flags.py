@@ -15,7 +15,7 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
-from experiments.config import (
+from .config import (
     Basics,
     Compute,
     Config,
@@ -26,8 +26,8 @@ from experiments.config import (
     Variant,
     part,
 )
-from experiments.entries import entries, flag, hints, read
-from experiments.errors import UsageError
+from .entries import entries, flag, hints, read
+from .errors import UsageError
 
 T = TypeVar("T")
 

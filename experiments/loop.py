@@ -8,13 +8,14 @@ from jax import Array
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
-from experiments import acting, records
-from experiments.acting import Scorer, Tick, Trials
-from experiments.build import Learn, State
-from experiments.parallel import devices
-from experiments.parallel.devices import Placement
-from experiments.progress import Progress
-from experiments.storage.folder import RunFolder
+
+from . import acting, records
+from .acting import Scorer, Tick, Trials
+from .build import Learn, State
+from .parallel import devices
+from .parallel.devices import Placement
+from .progress import Progress
+from .storage.folder import RunFolder
 
 
 class Phase(Protocol):

@@ -14,9 +14,11 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from experiments import acting, exploration, loop, records, robots
-from experiments.acting import Actors, Scorer, Tick, Trials
-from experiments.build import (
+from jaxpets.envs import Tasks
+
+from . import acting, exploration, loop, records, robots
+from .acting import Actors, Scorer, Tick, Trials
+from .build import (
     EXPLORE,
     FINETUNE,
     SCAN,
@@ -28,15 +30,14 @@ from experiments.build import (
     key_per,
     trial_keys,
 )
-from experiments.config import UNPLANNED, Config
-from experiments.parallel import devices
-from experiments.parallel.devices import SEED, TASK, Placement
-from experiments.progress import Progress
-from experiments.refit import refit
-from experiments.report import coverage
-from experiments.storage import rundir
-from experiments.storage.folder import RunFolder
-from jaxpets.envs import Tasks
+from .config import UNPLANNED, Config
+from .parallel import devices
+from .parallel.devices import SEED, TASK, Placement
+from .progress import Progress
+from .refit import refit
+from .report import coverage
+from .storage import rundir
+from .storage.folder import RunFolder
 
 
 @dataclasses.dataclass(frozen=True)

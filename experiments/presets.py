@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from experiments.config import (
+from .config import (
     Config,
     ModelConfig,
     PlannerConfig,

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import tqdm
 
-from experiments.errors import StoppedTogether
-from experiments.parallel import distributed
-from experiments.signals import first_signal
+from .errors import StoppedTogether
+from .parallel import distributed
+from .signals import first_signal
 
 # A log file gets a line per trial, no bar.
 _BAR = (

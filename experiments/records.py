@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 import jaxpets
-from experiments.acting import Scorer, Trials
-from experiments.errors import DivergedError
-from experiments.storage import metrics, pytrees
+
+from .acting import Scorer, Trials
+from .errors import DivergedError
+from .storage import metrics, pytrees
 
 # No plan is worth as little but one whose candidates all have the worst value, which is
 # shared by at most 1000 steps.

@@ -10,12 +10,12 @@ import time
 import jax
 from jax import Array
 
-from experiments import loop
-from experiments.build import REFIT, Parts, State, trial_keys
-from experiments.config import Config
-from experiments.parallel import devices
-from experiments.parallel.devices import SEED
-from experiments.storage.folder import RunFolder
+from . import loop
+from .build import REFIT, Parts, State, trial_keys
+from .config import Config
+from .parallel import devices
+from .parallel.devices import SEED
+from .storage.folder import RunFolder
 
 
 def refit(

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 
 import jaxpets
-from experiments import user_files
-from experiments.config import Config
-from experiments.errors import UsageError
-from experiments.storage import rundir
+
+from . import user_files
+from .config import Config
+from .errors import UsageError
+from .storage import rundir
 
 if TYPE_CHECKING:  # it brings mujoco, which wrong flags need not wait for
     from jaxpets.envs import Robot, Tasks

@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from experiments import cli, robots, signals
-from experiments.config import Config
-from experiments.cost import check_cpu, memory_advice
-from experiments.entries import differences, from_json, to_json
-from experiments.errors import (
+from . import cli, robots, signals
+from .config import Config
+from .cost import check_cpu, memory_advice
+from .entries import differences, from_json, to_json
+from .errors import (
     CheckpointError,
     OutOfMemoryError,
     RunError,
@@ -22,11 +22,11 @@ from experiments.errors import (
     UsageError,
     last_line,
 )
-from experiments.parallel import distributed
-from experiments.storage import rundir
+from .parallel import distributed
+from .storage import rundir
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
-    from experiments.storage.folder import RunFolder
+    from .storage.folder import RunFolder
 
 # Two checkpoints and one being written, of a paper-sized run of one seed and task.
 _NEEDED_BYTES = 64 * 2**20
@@ -70,7 +70,7 @@ def _list(words: Sequence[str]) -> None:
 
 def _dispatch(config: Config) -> None:
     if config.phase == "report":
-        from experiments.report import report
+        from .report import report
 
         for path in report.write_report(config.out, config.out / "report"):
             distributed.say(f"wrote {path}")
@@ -83,13 +83,13 @@ def _dispatch(config: Config) -> None:
 
 def _run(config: Config) -> "RunFolder":
     """Runs a phase that leaves a folder, and returns that."""
-    from experiments.storage.folder import RunFolder
+    from .storage.folder import RunFolder
 
     check_cpu(config)
     source = RunFolder(cli.explored_run(config))
     if config.phase == "explore":
         with _opened(config, source.path) as run:
-            from experiments import phases
+            from . import phases
 
             phases.explore(config, run)
         run.say(f"next: python -m experiments.run --phase zero-shot --from {run.path}")
@@ -97,7 +97,7 @@ def _run(config: Config) -> "RunFolder":
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
     with _opened(config, folder) as run:
-        from experiments import phases
+        from . import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
         phase(config, source, run, step)
@@ -115,7 +115,7 @@ def _variant(config: Config, step: int) -> str:
 @contextmanager
 def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     """Holds the folder of a run that a signal may stop."""
-    from experiments.storage import folder
+    from .storage import folder
 
     plain = to_json(config)
     branches = len(config.seeds)
@@ -147,7 +147,7 @@ def _explored_step(config: Config, source: "RunFolder") -> int:
 
 def _video(config: Config, run: "RunFolder") -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
-    from experiments.tools import video
+    from .tools import video
 
     assert config.video is not None
     names = robots.chosen(config, robots.of(config)).names

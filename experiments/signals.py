@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import Any, NoReturn
 
-from experiments.errors import InterruptedRun, last_line
+from .errors import InterruptedRun, last_line
 
 _URGENT = (signal.SIGINT, signal.SIGTERM)  # if they come again
 _SIGNALS = (*_URGENT, signal.SIGHUP)  # of which a terminal that closes sends several

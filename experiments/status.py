@@ -6,9 +6,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from experiments.errors import CheckpointError, printable
-from experiments.storage import rundir, status
-from experiments.storage.status import Status
+from .errors import CheckpointError, printable
+from .storage import rundir, status
+from .storage.status import Status
 
 _HEADER = ("run", "state", "trial", "steps/s", "left", "memory", "last line")
 _EPILOG = """

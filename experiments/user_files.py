@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from experiments.errors import UsageError, reason
+from .errors import UsageError, reason
 
 T = TypeVar("T")
 _FORM = re.compile(r"(.+\.py)(?::(\w+))?", re.DOTALL)

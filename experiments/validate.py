@@ -3,10 +3,10 @@
 import re
 from typing import Any
 
-from experiments.config import UNDIVIDED, Config, PlannerConfig
-from experiments.entries import Mark, entries, flag
-from experiments.errors import UsageError
-from experiments.storage import rundir
+from .config import UNDIVIDED, Config, PlannerConfig
+from .entries import Mark, entries, flag
+from .errors import UsageError
+from .storage import rundir
 
 
 def require(holds: bool, flag: str, value: Any, valid: str) -> None:

@@ -5,6 +5,7 @@ import graphlib
 import re
 import subprocess
 import sys
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -145,16 +146,22 @@ MODULES = {name_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
 
 
-def imports(tree):
-    """Dotted names of everything that is imported, wherever it stands."""
+def imports(tree, package=None):
+    """Dotted names of everything that is imported, wherever it stands.
+
+    Relative imports are read as those of a module of `package`.
+    """
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
-            found += [f"{node.module}.{alias.name}" for alias in node.names]
-            found.append(node.module)
+            assert not node.level or package, "imports are absolute"
+            module = node.module or ""
+            if node.level:
+                module = resolve_name("." * node.level + module, package)
+            found += [f"{module}.{alias.name}" for alias in node.names]
+            found.append(module)
     return found
 
 
@@ -233,7 +240,8 @@ OUTSIDE = [
 @pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: path.stem)
 def test_the_outside_uses_public_names_only(path):
     tree = ast.parse(path.read_text())
-    for dotted in imports(tree):
+    package = ".".join(path.relative_to(REPOSITORY).parent.parts)
+    for dotted in imports(tree, package):
         assert not dotted.startswith("jaxpets._src"), f"{path.name} imports {dotted}"
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
@@ -253,24 +261,23 @@ ORBAX = {"storage.checkpoint", "tools.digests"}
 
 
 def experiments_imports():
-    """Returns for every module of experiments what else of them it imports."""
+    """Returns for every module of experiments the names of all that it imports."""
     root = REPOSITORY / "experiments"
-    paths = {
-        ".".join(path.relative_to(root).with_suffix("").parts): path
-        for path in sorted(root.rglob("*.py"))
-        if path.name != "__init__.py"
-    }
     found = {}
-    for name, path in paths.items():
-        dotted = {
-            name.removeprefix("experiments.")
-            for name in imports(ast.parse(path.read_text()))
-        }
-        found[name] = (dotted & paths.keys()) - {name}
+    for path in sorted(root.rglob("*.py")):
+        if path.name != "__init__.py":
+            parts = path.relative_to(root).with_suffix("").parts
+            package = ".".join(("experiments", *parts[:-1]))
+            found[".".join(parts)] = imports(ast.parse(path.read_text()), package)
     return found
 
 
-EXPERIMENTS = experiments_imports()
+IMPORTED = experiments_imports()
+# For every module of experiments what else of them it imports.
+EXPERIMENTS = {
+    name: {x.removeprefix("experiments.") for x in dotted} & IMPORTED.keys() - {name}
+    for name, dotted in IMPORTED.items()
+}
 
 
 def room(name):
@@ -303,11 +310,10 @@ def test_the_walls_are_seen():
 
 
 def test_orbax_has_one_home():
-    paths = {name: path_of(name) for name in EXPERIMENTS}
     found = {
         name
-        for name, path in paths.items()
-        if any(x.split(".")[0] == "orbax" for x in imports(ast.parse(path.read_text())))
+        for name, dotted in IMPORTED.items()
+        if any(x.split(".")[0] == "orbax" for x in dotted)
     }
     assert found == ORBAX
 

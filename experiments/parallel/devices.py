@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from experiments.parallel import distributed
+from . import distributed
 
 _CHOSEN = "jax_default_device"
 SEED, TASK, TRIAL = AXES = ("seed", "task", "trial")

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from experiments import errors
-from experiments.errors import (
+from .. import errors
+from ..errors import (
     InterruptedRun,
     OutOfMemoryError,
     RunError,

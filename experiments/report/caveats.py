@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.config import Config, Evaluation, Exploration, Mark, Tuning
-from experiments.entries import entries
-from experiments.report.logs import Row, Scores, number
-from experiments.report.tables import ARMS, flat, in_order, tasks_of
-from experiments.storage import rundir
+from ..config import Config, Evaluation, Exploration, Mark, Tuning
+from ..entries import entries
+from ..storage import rundir
+from .logs import Row, Scores, number
+from .tables import ARMS, flat, in_order, tasks_of
 
 # What a phase depends on; the rest it keeps in its config for the phases after it.
 _DEPENDS_ON = {

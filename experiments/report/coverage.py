@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from experiments.errors import UsageError
-from experiments.report import logs
-from experiments.storage import metrics, rundir
+from ..errors import UsageError
+from ..storage import metrics, rundir
+from . import logs
 
 if TYPE_CHECKING:  # they bring orbax and mujoco, which a report need not have
-    from experiments.storage.folder import RunFolder
     from jaxpets.envs import Axis
+
+    from ..storage.folder import RunFolder
 
 _FILE = "coverage.json"
 _EDGES = "_edges"

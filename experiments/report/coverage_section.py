@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.errors import UsageError
-from experiments.report import coverage, figures, tables
-from experiments.report.coverage import Scale, Seen
-from experiments.storage import rundir
+from ..errors import UsageError
+from ..storage import rundir
+from . import coverage, figures, tables
+from .coverage import Scale, Seen
 
 _COVERAGE = (
     "Where the transitions of exploration ended: {bins}, the "

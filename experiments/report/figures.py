@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from experiments.report import stats, style
-from experiments.report.coverage import Scale
+from . import stats, style
+from .coverage import Scale
 
 _LOG_RATIO = 1000.0  # a range that a linear axis would hide
 

@@ -7,10 +7,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from experiments.errors import CheckpointError, UsageError
-from experiments.storage import metrics, rundir
-from experiments.storage.metrics import Row, number
-from experiments.storage.rundir import Name
+from ..errors import CheckpointError, UsageError
+from ..storage import metrics, rundir
+from ..storage.metrics import Row, number
+from ..storage.rundir import Name
 
 Points = dict[int, dict[int, float]]  # trial -> seed -> number
 Scores = dict[str, dict[str, dict[int, float]]]  # arm -> task -> seed -> score

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-from experiments.report import style
+from . import style
 
 _INK = "#333333"
 _PAPER = "#F7F7F7"

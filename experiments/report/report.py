@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.config import UNPLANNED
-from experiments.report import (
+from ..config import UNPLANNED
+from ..storage import disk
+from . import (
     caveats,
     coverage,
     coverage_section,
@@ -17,9 +18,9 @@ from experiments.report import (
     tables,
     task_sections,
 )
-from experiments.report.coverage import Seen
-from experiments.report.figures import Curve, TaskPanels
-from experiments.report.logs import (
+from .coverage import Seen
+from .figures import Curve, TaskPanels
+from .logs import (
     Points,
     Row,
     Scores,
@@ -28,7 +29,6 @@ from experiments.report.logs import (
     scores,
     tuning,
 )
-from experiments.storage import disk
 
 __all__ = ["load", "write_report"]
 

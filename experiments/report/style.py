@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.storage import disk
+from ..storage import disk
 
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 BLUE = "#0072B2"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.report import stats
-from experiments.report.logs import Points, Row, Scores
-from experiments.storage import rundir
+from ..storage import rundir
+from . import stats
+from .logs import Points, Row, Scores
 
 TASKS = ("forward", "backward", "front-flip", "back-flip")
 ARMS = ("epistemic", "count", "random", "oracle", "one-step")

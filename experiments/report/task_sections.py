@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.report import figures, tables
-from experiments.report.logs import Row, Scores, named_by_tag, number, scores, tuning
+from . import figures, tables
+from .logs import Row, Scores, named_by_tag, number, scores, tuning
 
 _OURS = ("best", "epistemic")  # what the other arms are baselines of
 

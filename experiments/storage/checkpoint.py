@@ -26,9 +26,10 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
 import jaxpets
-from experiments.errors import CheckpointError, DivergedError, RunError, StorageError
-from experiments.storage import disk, pytrees, step_folders
-from experiments.storage.step_folders import broken, names, seal, steps
+
+from ..errors import CheckpointError, DivergedError, RunError, StorageError
+from . import disk, pytrees, step_folders
+from .step_folders import broken, names, seal, steps
 
 __all__ = ["restore", "save", "steps"]
 

@@ -9,7 +9,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments.errors import StorageError, storage_errors
+from ..errors import StorageError, storage_errors
 
 _DRAFT = ".tmp-"
 

@@ -12,8 +12,9 @@ from typing import Any
 import jax
 
 import jaxpets
-from experiments.errors import CheckpointError
-from experiments.storage import rundir
+
+from ..errors import CheckpointError
+from . import rundir
 
 _PACKAGES = (
     "jax",

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import errors
-from experiments.errors import StorageError
-from experiments.parallel import distributed
-from experiments.storage import (
+from .. import errors
+from ..errors import StorageError
+from ..parallel import distributed
+from . import (
     checkpoint,
     disk,
     identity,
@@ -25,9 +25,9 @@ from experiments.storage import (
     status,
     trajectories,
 )
-from experiments.storage.environment import environment, remember
-from experiments.storage.identity import Differences
-from experiments.storage.status import Writer
+from .environment import environment, remember
+from .identity import Differences
+from .status import Writer
 
 
 class RunFolder(NamedTuple):

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import CheckpointError
-from experiments.storage import checkpoint, rundir
+from ..errors import CheckpointError
+from . import checkpoint, rundir
 
 # (of the start, of now, where the first is) -> what differs between configs in JSON.
 Differences = Callable[[Any, Any, str], list[str]]

@@ -29,9 +29,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from experiments.errors import storage_errors
-from experiments.parallel import distributed
-from experiments.storage import disk, rundir
+from ..errors import storage_errors
+from ..parallel import distributed
+from . import disk, rundir
 
 # Names in rows of older versions.
 _RENAMED = {"loss": "nll"}

@@ -18,14 +18,14 @@ import jax
 import msgspec
 import numpy as np
 
-from experiments.errors import (
+from ..errors import (
     CheckpointError,
     StorageError,
     UsageError,
     storage_errors,
 )
-from experiments.storage import disk
-from experiments.storage.disk import free_bytes, megabytes
+from . import disk
+from .disk import free_bytes, megabytes
 
 CONFIG = "config.json"
 ENVIRONMENT = "env.json"

@@ -14,8 +14,8 @@ from typing import Any
 
 import msgspec
 
-from experiments.errors import CheckpointError, StorageError, storage_errors
-from experiments.storage import disk, rundir
+from ..errors import CheckpointError, StorageError, storage_errors
+from . import disk, rundir
 
 RUNNING, INTERRUPTED, FAILED, COMPLETE, KILLED = (
     "running", "interrupted", "failed", "complete", "killed",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.storage import disk
+from . import disk
 
 
 def save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -26,15 +26,16 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from experiments import exploration, robots
-from experiments.build import State, build
-from experiments.config import Config
-from experiments.entries import to_json
-from experiments.errors import RunError, UsageError
-from experiments.report import tables
-from experiments.storage import metrics, rundir
-from experiments.storage.folder import RunFolder
 from jaxpets.envs import Robot
+
+from .. import exploration, robots
+from ..build import State, build
+from ..config import Config
+from ..entries import to_json
+from ..errors import RunError, UsageError
+from ..report import tables
+from ..storage import metrics, rundir
+from ..storage.folder import RunFolder
 
 # `Ensemble.predict`.
 Predict = Callable[[jaxpets.EnsembleParams, Array, Array], tuple[Array, Array]]

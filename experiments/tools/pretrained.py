@@ -15,14 +15,14 @@ from pathlib import Path
 
 import jax
 
-from experiments import cli, exploration, user_files
-from experiments.build import State, build
-from experiments.config import Config
-from experiments.entries import to_json
-from experiments.errors import RunError, UsageError
-from experiments.presets import PRETRAINED_PLANNER
-from experiments.storage import disk, metrics, rundir
-from experiments.storage.folder import RunFolder
+from .. import cli, exploration, user_files
+from ..build import State, build
+from ..config import Config
+from ..entries import to_json
+from ..errors import RunError, UsageError
+from ..presets import PRETRAINED_PLANNER
+from ..storage import disk, metrics, rundir
+from ..storage.folder import RunFolder
 
 
 def ship(run: Path, name: str, seed: int | None = None) -> Path:

@@ -14,12 +14,13 @@ from typing import Any
 import jax
 
 import jaxpets
-from experiments import exploration
-from experiments.build import build
-from experiments.config import Config, PlannerConfig
-from experiments.errors import RunError, UsageError
-from experiments.storage import rundir
-from experiments.storage.folder import RunFolder
+
+from .. import exploration
+from ..build import build
+from ..config import Config, PlannerConfig
+from ..errors import RunError, UsageError
+from ..storage import rundir
+from ..storage.folder import RunFolder
 
 _ALL = ("horizon", "num_samples", "num_iterations")
 _SETTINGS = {

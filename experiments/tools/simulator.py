@@ -17,14 +17,15 @@ import numpy as np
 import tyro
 
 import jaxpets
-from experiments import acting, robots
-from experiments.build import imagined_end, optimizer
-from experiments.config import EngineName, PlannerConfig
-from experiments.errors import RunError
-from experiments.presets import PRETRAINED_PLANNER
-from experiments.storage import metrics, rundir
-from experiments.storage.environment import environment
 from jaxpets.envs import Robot, env_rollout, with_constants
+
+from .. import acting, robots
+from ..build import imagined_end, optimizer
+from ..config import EngineName, PlannerConfig
+from ..errors import RunError
+from ..presets import PRETRAINED_PLANNER
+from ..storage import metrics, rundir
+from ..storage.environment import environment
 
 
 @dataclasses.dataclass(frozen=True)

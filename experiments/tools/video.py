@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.errors import RunError, UsageError
-from experiments.storage import disk
-from experiments.tools.renderer import Draw, Look, open_renderer
+from ..errors import RunError, UsageError
+from ..storage import disk
+from .renderer import Draw, Look, open_renderer
 
 if TYPE_CHECKING:  # it brings mujoco, which may find no OpenGL
     from jaxpets.envs import Robot
@@ -53,7 +53,7 @@ def render(
     Raises:
       RunError: if no OpenGL works here, or the child fails; one line says why.
     """
-    command = [sys.executable, "-m", "experiments.tools.video", str(npz), str(target)]
+    command = [sys.executable, "-m", f"{__package__}.video", str(npz), str(target)]
     command += [f"--env={env}"] * (env is not None)
     command += [f"--task={task}", f"--seed={seed}", f"--trial={trial}"]
     command += ["--gif"] * gif
@@ -235,8 +235,8 @@ def _render_here(args: argparse.Namespace) -> None:
 def _robot(env: str | None) -> "Robot":
     """Returns the robot that is drawn."""
     try:
-        from experiments import robots
-        from experiments.storage.rundir import HALF_CHEETAH
+        from .. import robots
+        from ..storage.rundir import HALF_CHEETAH
 
         robot = robots.named(env or HALF_CHEETAH, "mujoco")
     except RunError:
