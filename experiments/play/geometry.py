@@ -229,3 +229,52 @@ def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     w2, v2 = second[..., :1], second[..., 1:]
     scalar = w * w2 - np.sum(v * v2, -1, keepdims=True)
     return np.concatenate([scalar, w * v2 + w2 * v + np.cross(v, v2)], -1)
+
+
+def pushes(model: Any) -> dict[str, np.ndarray]:
+    """Returns velocities `[V]` to add to those of a robot, by a name for each.
+
+    Of the root, where it moves freely along x or z; else of the first joint.
+    """
+    found = {}
+    speed = 1.5 * np.sqrt(9.81 * max(float(model.stat.meansize), 0.1))
+    directions = {"push back": (0, -speed), "push on": (0, speed), "toss": (2, speed)}
+    for name, (axis, value) in directions.items():
+        dof = _root_dof(model, axis)
+        if dof is not None:
+            found[name] = value * np.eye(model.nv, dtype=np.float32)[dof]
+    if not found and model.nv:
+        kick = np.eye(model.nv, dtype=np.float32)[0]
+        found = {"push back": -2 * kick, "push on": 2 * kick}
+    return found
+
+
+def _root_dof(model: Any, axis: int) -> int | None:
+    """Returns which velocity moves the first body along a world axis."""
+    for joint in range(model.njnt):
+        if model.jnt_bodyid[joint] != 1:
+            break
+        dof = int(model.jnt_dofadr[joint])
+        if model.jnt_type[joint] == _C.mjtJoint.mjJNT_FREE:
+            return dof + axis
+        is_slide = model.jnt_type[joint] == _C.mjtJoint.mjJNT_SLIDE
+        if is_slide and not model.jnt_limited[joint] and model.jnt_axis[joint][axis] == 1:
+            return dof
+    return None
+
+
+def is_roaming(model: Any) -> bool:
+    """Returns whether the robot may go where it likes."""
+    return any(_root_dof(model, axis) is not None for axis in (0, 1))
+
+
+def size(model: Any) -> float:
+    """Returns how far the parts of a robot are from its middle as it starts, in m."""
+    data = _C.MjData(model)
+    _C.mj_kinematics(model, data)
+    moving = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_rgba[:, 3] > 0))
+    if not len(moving):
+        return float(model.stat.extent)
+    places, radii = data.geom_xpos[moving], model.geom_rbound[moving, None]
+    low, high = (places - radii).min(0), (places + radii).max(0)
+    return float(np.linalg.norm(high - low)) / 2

@@ -1,0 +1,92 @@
+"""A robot that plans: frames from compiled programs."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpets.envs import Robot
+
+from .asking import Asked
+from .core import Core, World
+from .geometry import pushes
+from .history import Frame
+
+
+class Stepper(Protocol):
+    """What a session shows: it gives a frame for a frame.
+
+    Attributes:
+      step_time: of a step, in s.
+      pushes: names of the pushes that there are, and the velocities `[V]` that each
+        adds.
+    """
+
+    step_time: float
+    pushes: Mapping[str, np.ndarray]
+
+    def start(self, asked: Asked) -> Frame:
+        """Returns the first frame of a new trial."""
+        ...
+
+    def step(self, frame: Frame, asked: Asked, push: str | None) -> tuple[Frame, str]:
+        """Returns the frame after a frame, and why there is none after it, if so."""
+        ...
+
+
+class Live:
+    """A robot that plans for what is asked."""
+
+    def __init__(self, robot: Robot, core: Core, params: Any, seed: int = 0) -> None:
+        self.step_time = robot.step_time
+        self.pushes = pushes(robot.model) if core.push_size else {}
+        self._still = np.zeros(core.push_size, np.float32)
+        self._params = params
+        self._horizon = core.horizon
+        self._key, self._start_key = jax.random.split(jax.random.key(seed))
+        self._starts = 0
+        self._start, self._think, self._act = (
+            jax.jit(x) for x in (core.start, core.think, core.act)
+        )
+
+    def start(self, asked: Asked) -> Frame:
+        """Returns the first frame of a new trial; the first call compiles."""
+        key = jax.random.fold_in(self._start_key, self._starts)
+        self._starts += 1
+        world = self._start(asked.wish, key)
+        # Compiled now, while somebody is told so.
+        frame, _ = self._stepped(world, asked, None)
+        return frame._replace(
+            number=0, qpos=np.asarray(world.qpos), obs=np.asarray(world.env.obs), world=world
+        )
+
+    def step(self, frame: Frame, asked: Asked, push: str | None) -> tuple[Frame, str]:
+        """Returns the frame after a frame, and why a new trial must begin, if so."""
+        assert frame.world is not None
+        return self._stepped(frame.world, asked, push)
+
+    def _stepped(
+        self, world: World, asked: Asked, push: str | None
+    ) -> tuple[Frame, str]:
+        added = self.pushes[push] if push else self._still
+        thought = self._think(self._params, asked.wish, self._key, world)
+        world, earned, ended = self._act(asked.wish, jnp.asarray(added), world, thought)
+        ghosts = np.asarray(thought.ghosts)
+        members, particles = ghosts.shape[:2]
+        frame = Frame(
+            number=int(world.number),
+            qpos=np.asarray(world.qpos),
+            obs=np.asarray(world.env.obs),
+            ghosts=ghosts.reshape(-1, *ghosts.shape[2:]),
+            members=np.repeat(np.arange(members), particles),
+            earned=float(earned),
+            promise=float(thought.promise),
+            disagreement=float(thought.disagreement),
+            wanted=asked.words,
+            world=world,
+        )
+        if not np.isfinite(frame.qpos).all():
+            return frame, "physics diverged"
+        return frame, "the trial ended" if bool(ended) else ""

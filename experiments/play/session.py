@@ -1,0 +1,188 @@
+"""The one owner of the world: a thread that steps it, remembers, and takes orders.
+
+Others look at what it publishes, which never changes, and leave orders in a queue. So
+nothing that a page does can stop it: it looks at the controls once a step.
+"""
+
+import queue
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from .asking import Asked
+from .clock import Clock
+from .history import Frame, History
+from .live import Stepper
+
+MEMORY = 60.0  # s
+_IDLE = 1 / 30  # s between looks at the controls while the world stands still
+
+
+class Shown(NamedTuple):
+    """What is to be shown: frames, and when each of them is reached.
+
+    Attributes:
+      times: in s, as `time.monotonic` has them, increasing.
+      frames: as many.
+    """
+
+    times: tuple[float, ...]
+    frames: tuple[Frame, ...]
+
+    def at(self, now: float) -> tuple[Frame, Frame, float]:
+        """Returns two frames, and how much of the way is done from one to the other."""
+        for i in range(len(self.times) - 1, 0, -1):
+            start, end = self.times[i - 1], self.times[i]
+            if now >= start:
+                share = (now - start) / max(end - start, 1e-6)
+                return self.frames[i - 1], self.frames[i], min(share, 1.0)
+        return self.frames[0], self.frames[0], 1.0
+
+
+class Session:
+    """Owns the world. Methods are for its own thread, but where they say otherwise."""
+
+    def __init__(
+        self,
+        stepper: Stepper,
+        asked: Asked,
+        look: Callable[["Session"], None] = lambda session: None,
+    ) -> None:
+        """Prepares a session, which `run` runs.
+
+        Args:
+          stepper: gives frames.
+          asked: at first.
+          look: called before every step, to read controls and give orders.
+        """
+        self.stepper = stepper
+        self.asked = asked
+        self.speed = 1.0
+        self.is_paused = False
+        self.history = History(MEMORY, stepper.step_time)
+        self.clock = Clock(stepper.step_time)
+        self.notice = ""
+        self.shown: Shown | None = None  # any thread may read it
+        self._look = look
+        self._orders: queue.SimpleQueue[Callable[[Session], None]] = queue.SimpleQueue()
+        self._stopped = threading.Event()
+        self._push: str | None = None
+        self._steps = 0  # to do while paused
+        self._back = 0.0
+
+    # For any thread.
+
+    def order(self, what: Callable[["Session"], None]) -> None:
+        """Has the world's thread do something, before its next step."""
+        self._orders.put(what)
+
+    def stop(self) -> None:
+        """Ends `run` after the step under way."""
+        self._stopped.set()
+
+    def run(self) -> None:
+        """Steps the world until it is stopped; a failure is said, and tried again."""
+        self.restart()
+        while not self._stopped.is_set():
+            try:
+                self.tick()
+            except Exception as error:  # of whatever a visitor or a file has brought
+                traceback.print_exc()
+                self.notice = f"stopped by an error: {error}"
+                self.is_paused = True
+                self._stopped.wait(_IDLE)
+
+    # Orders.
+
+    def restart(self) -> None:
+        """Begins a new trial."""
+        self._back = 0.0
+        frame = self.stepper.start(self.asked)
+        self.history.append(frame)
+        self._show_only(frame)
+
+    def pause(self, is_paused: bool) -> None:
+        """Stops the world, or lets it go on from where it is."""
+        self.is_paused = is_paused
+        self.look_back(0.0)
+
+    def step_once(self) -> None:
+        """Does one step, and stands still."""
+        if not self.is_paused:
+            self.pause(True)
+        self.look_back(0.0)
+        self._steps += 1
+
+    def push(self, name: str) -> None:
+        """Pushes the robot at the next step."""
+        if name in self.stepper.pushes:
+            self._push = name
+
+    def look_back(self, seconds: float) -> None:
+        """Shows a moment of the last minute; other than the last, the world waits."""
+        seconds = min(max(seconds, 0.0), self.history.seconds)
+        if seconds == self._back:
+            return
+        self._back = seconds
+        self.is_paused = self.is_paused or seconds > 0
+        self._show_only(self.history.at(seconds))
+
+    def go_on_from_here(self) -> None:
+        """Goes on from what is shown; what came after it is forgotten."""
+        self.history.drop_after(self.history.at(self._back))
+        self._back = 0.0
+        self.is_paused = False
+
+    @property
+    def back(self) -> float:
+        """How many s before the last moment it is that is shown."""
+        return self._back
+
+    def recent(self, seconds: float = MEMORY) -> Sequence[Frame]:
+        """Returns the frames of the last seconds, for any thread."""
+        return self.history.recent(seconds)
+
+    # Its loop.
+
+    def tick(self) -> None:
+        """Waits until a step is due, obeys, and steps."""
+        if self.is_paused:
+            self._stopped.wait(_IDLE)
+            self.clock.restart()
+        elif delay := self.clock.wait():
+            self._stopped.wait(delay)
+        self._obey()
+        if self._stopped.is_set() or (self.is_paused and not self._steps):
+            return
+        self._steps = max(0, self._steps - 1)
+        self._step()
+
+    def _obey(self) -> None:
+        self._look(self)
+        for _ in range(self._orders.qsize()):
+            self._orders.get_nowait()(self)
+
+    def _step(self) -> None:
+        last, push, self._push = self.history.at(0.0), self._push, None
+        self.clock.begin(self.speed)
+        frame, over = self.stepper.step(last, self.asked, push)
+        if over:
+            self.notice = f"{over}: a new one has begun"
+            self.restart()
+            return
+        self.history.append(frame)
+        if self.is_paused:
+            self._show_only(frame)
+            return
+        self._show_next(frame, self.clock.end())
+
+    def _show_only(self, frame: Frame) -> None:
+        self.shown = Shown((time.monotonic(),), (frame,))
+        self.clock.restart()
+
+    def _show_next(self, frame: Frame, at: float) -> None:
+        before = self.shown
+        assert before is not None
+        self.shown = Shown((*before.times[-3:], at), (*before.frames[-3:], frame))
