@@ -56,6 +56,7 @@ class Slider(NamedTuple):
     unit: str
     low: float
     high: float
+    step: float
     weight: float
 
 
@@ -191,7 +192,8 @@ def _slider(word: str, unit: str, low: float, high: float) -> Slider | None:
         return None
     step = _rounded(width / _STEPS)
     ends = (step * np.floor(low / step), step * np.ceil(high / step))
-    return Slider(word, unit, *map(_rounded, ends), weight=1 / width)
+    low, high = (round(float(end), 6) for end in ends)
+    return Slider(word, unit, low, high, step, weight=1 / width)
 
 
 def _word(words: Mapping[str, int], name: str, place: int) -> str:
@@ -201,5 +203,7 @@ def _word(words: Mapping[str, int], name: str, place: int) -> str:
 
 
 def _rounded(value: float) -> float:
-    """Returns the nearest number of two digits."""
-    return float(f"{value:.1e}")
+    """Returns the nearest of ..., 0.1, 0.2, 0.5, 1, 2, 5, ..."""
+    scale = 10.0 ** np.floor(np.log10(value))
+    nearest = min((1, 2, 5, 10), key=lambda digit: abs(np.log(digit * scale / value)))
+    return float(f"{nearest * scale:.0e}")
