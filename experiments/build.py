@@ -63,7 +63,7 @@ def build(config: Config) -> Parts:
     def planner(
         reward_fn: jaxpets.typing.RewardFn, search: PlannerConfig
     ) -> tuple[jaxpets.Planner, str]:
-        rollout, kind = _rollout(robot, size, search)
+        rollout, kind = rollout_of(robot, size, search)
         unroll = kind.startswith(KERNEL) and jax.default_backend() == "gpu"
         search_fn = optimizer(search, env, unroll)
         planner = jaxpets.plan(rollout, reward_fn, search_fn, terminal_fn=terminal_fn)
@@ -193,7 +193,7 @@ def _planned(config: Config, robot: Robot) -> jaxpets.Ensemble:
     return _ensemble(robot, ensemble_config(config.model), precision)
 
 
-def _rollout(
+def rollout_of(
     robot: Robot, size: jaxpets.EnsembleConfig, search: PlannerConfig
 ) -> tuple[jaxpets.typing.RolloutFn, str]:
     """Returns the rollout of a search, and what decides about its last bits.

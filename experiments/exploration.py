@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -13,6 +13,7 @@ from . import user_files
 from .build import EXPLORE, Parts, State, build, trial_keys
 from .config import Config
 from .entries import from_json
+from .errors import UsageError
 from .presets import PRESETS
 from .storage import rundir
 from .storage.folder import RunFolder
@@ -42,6 +43,44 @@ def without_files(config: Config, env: str | None, run: Path) -> Config:
     """
     user_files.check_named("--env", env, config.env, run / rundir.CONFIG)
     return dataclasses.replace(config, arm="random", tasks=None)
+
+
+class Explored(NamedTuple):
+    """The model of one seed of a run, as it was last saved."""
+
+    config: Config
+    parts: Parts
+    seed: int
+    trial: int
+    params: jaxpets.EnsembleParams
+
+
+def explored(run: Path, *, seed: int | None, env: str | None) -> Explored:
+    """Returns the model of a run.
+
+    Args:
+      run: its folder.
+      seed: which of the run's; None for the first.
+      env: the robot, which must be said if it is of a file.
+
+    Raises:
+      RunError: if the run has no checkpoint or not that seed, or its robot is of a
+        file that nobody named.
+    """
+    folder = RunFolder(run)
+    config = config_of(folder)
+    seed = config.seeds[0] if seed is None else seed
+    if seed not in config.seeds:
+        valid = ", ".join(map(str, config.seeds))
+        raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
+    parts = build(without_files(config, env, run))
+    found = folder.restore(model_of(template(config, parts)), part=True)
+    if found is None:
+        raise UsageError(f"{run} has no checkpoint.")
+    trial, state = found
+    i = config.seeds.index(seed)
+    params = jax.tree.map(lambda x: x[i], state.params)
+    return Explored(config, parts, seed, trial, params)
 
 
 def template(config: Config, parts: Parts) -> State:
@@ -101,3 +140,19 @@ def model_of(state: State) -> State:
 def data_of(state: State) -> State:
     """Returns the dataset of a learner, with nothing in the other places."""
     return jax.tree.map(lambda _: None, state)._replace(dataset=state.dataset)
+
+
+def data_template(leaves: Mapping[str, Any]) -> State:
+    """Returns the form of the dataset `[S]` of a checkpoint, of what its leaves are.
+
+    With it the data are read without building what learns.
+    """
+
+    def leaf(name: str) -> jax.ShapeDtypeStruct:
+        found = leaves[f"dataset/{name}"]
+        return jax.ShapeDtypeStruct(tuple(found["shape"]), found["dtype"])
+
+    fields = jaxpets.Transition._fields
+    rows = jaxpets.Transition(*(leaf(f"data/{name}") for name in fields))
+    dataset = jaxpets.typing.Dataset(rows, leaf("size"), leaf("cursor"))
+    return jaxpets.typing.LearnerState(None, None, dataset, None)  # pyright: ignore

@@ -111,3 +111,8 @@ def small(text: str, color: str = "inherit") -> str:
     """Returns a paragraph of HTML, of text that is HTML already."""
     style = f"font-size:0.85em;line-height:1.4;padding:0 0.75em 0.5em;color:{color}"
     return f'<div style="{style};overflow-wrap:anywhere">{text}</div>'
+
+
+def escaped(text: str) -> str:
+    """Returns HTML that shows a text as it is."""
+    return html.escape(text)

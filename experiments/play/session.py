@@ -1,10 +1,9 @@
 """The one owner of the world: a thread that steps it, remembers, and takes orders.
 
-Others look at what it publishes, which never changes, and leave orders in a queue. So
-nothing that a page does can stop it: it looks at the controls once a step.
+Others look at what it publishes, which never changes. Nothing that a page does can stop
+it: it looks at the controls once a step.
 """
 
-import queue
 import threading
 import time
 import traceback
@@ -44,18 +43,12 @@ class Shown(NamedTuple):
 class Session:
     """Owns the world. Methods are for its own thread, but where they say otherwise."""
 
-    def __init__(
-        self,
-        stepper: Stepper,
-        asked: Asked,
-        look: Callable[["Session"], None] = lambda session: None,
-    ) -> None:
+    def __init__(self, stepper: Stepper, asked: Asked) -> None:
         """Prepares a session, which `run` runs.
 
         Args:
           stepper: gives frames.
           asked: at first.
-          look: called before every step, to read controls and give orders.
         """
         self.stepper = stepper
         self.asked = asked
@@ -65,8 +58,6 @@ class Session:
         self.clock = Clock(stepper.step_time)
         self.notice = ""
         self.shown: Shown | None = None  # any thread may read it
-        self._look = look
-        self._orders: queue.SimpleQueue[Callable[[Session], None]] = queue.SimpleQueue()
         self._stopped = threading.Event()
         self._push: str | None = None
         self._steps = 0  # to do while paused
@@ -74,20 +65,19 @@ class Session:
 
     # For any thread.
 
-    def order(self, what: Callable[["Session"], None]) -> None:
-        """Has the world's thread do something, before its next step."""
-        self._orders.put(what)
-
     def stop(self) -> None:
         """Ends `run` after the step under way."""
         self._stopped.set()
 
-    def run(self) -> None:
-        """Steps the world until it is stopped; a failure is said, and tried again."""
-        self.restart()
+    def run(self, steer: Callable[["Session"], None]) -> None:
+        """Steps the world until it is stopped; a failure is said, and the world waits.
+
+        Args:
+          steer: called before every step; reads controls and gives orders.
+        """
         while not self._stopped.is_set():
             try:
-                self.tick()
+                self.tick(steer)
             except Exception as error:  # of whatever a visitor or a file has brought
                 traceback.print_exc()
                 self.notice = f"stopped by an error: {error}"
@@ -146,23 +136,21 @@ class Session:
 
     # Its loop.
 
-    def tick(self) -> None:
+    def tick(self, steer: Callable[["Session"], None]) -> None:
         """Waits until a step is due, obeys, and steps."""
+        if self.shown is None:
+            self.restart()
+            self.notice = ""
         if self.is_paused:
             self._stopped.wait(_IDLE)
             self.clock.restart()
         elif delay := self.clock.wait():
             self._stopped.wait(delay)
-        self._obey()
+        steer(self)
         if self._stopped.is_set() or (self.is_paused and not self._steps):
             return
         self._steps = max(0, self._steps - 1)
         self._step()
-
-    def _obey(self) -> None:
-        self._look(self)
-        for _ in range(self._orders.qsize()):
-            self._orders.get_nowait()(self)
 
     def _step(self) -> None:
         last, push, self._push = self.history.at(0.0), self._push, None

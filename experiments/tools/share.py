@@ -11,14 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-
 import jaxpets
 
 from .. import exploration
-from ..build import build
 from ..config import Config, PlannerConfig
-from ..errors import RunError, UsageError
+from ..errors import RunError
 from ..storage import rundir
 from ..storage.folder import RunFolder
 
@@ -46,27 +43,16 @@ def share(
       RunError: if the run has no checkpoint or not that seed, or its robot is of a
         file that nobody named.
     """
-    folder = RunFolder(run)
-    config = exploration.config_of(folder)
-    seed = config.seeds[0] if seed is None else seed
-    if seed not in config.seeds:
-        valid = ", ".join(map(str, config.seeds))
-        raise UsageError(f"--seed {seed} is not valid; it must be one of {valid}.")
-    parts = build(exploration.without_files(config, env, run))
-    template = exploration.model_of(exploration.template(config, parts))
-    found = folder.restore(template, part=True)
-    if found is None:
-        raise UsageError(f"{run} has no checkpoint.")
-    trial, state = found
-    i = config.seeds.index(seed)
-    params = jax.tree.map(lambda x: x[i], state.params)
+    found = exploration.explored(run, seed=seed, env=env)
+    config = found.config
     about = {
         "environment": config.env if env is None else rundir.label(env),
         "licence": licence,
-        "training": _training(folder, config, seed, trial),
+        "training": _training(RunFolder(run), config, found.seed, found.trial),
         "search": _search(config.task_planner),
     }
-    jaxpets.save_model(path, _as_performed(parts.model, config), params, about=about)
+    model = _as_performed(found.parts.model, config)
+    jaxpets.save_model(path, model, found.params, about=about)
 
 
 def _as_performed(model: jaxpets.Ensemble, config: Config) -> jaxpets.Ensemble:

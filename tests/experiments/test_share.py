@@ -28,7 +28,7 @@ def test_the_shipped_model_acts_as_its_run(tmp_path, monkeypatch):
         built.append(build(dataclasses.replace(config, **slow)))
         return built[0]
 
-    monkeypatch.setattr(share, "build", build_without_kernels)
+    monkeypatch.setattr(exploration, "build", build_without_kernels)
     source, path = cli.PRETRAINED / "best", tmp_path / "best.safetensors"
     assert share.main([str(source), str(path)]) == 0
     model, params = jaxpets.load_model(path)

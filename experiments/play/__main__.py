@@ -1,0 +1,92 @@
+"""`python -m experiments.play`: opens a page on which a robot does what it is asked."""
+
+import argparse
+import os
+import sys
+import threading
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+from .. import robots, signals
+from ..errors import InterruptedRun, RunError, UsageError
+
+_FROM = "pretrained/best"
+_EPILOG = """
+Ctrl-C ends it. Whoever is told the address may steer the robot: without --host that is
+this machine alone, and with it whoever has the token that is then in the address."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serves a page until a signal comes, and returns the exit code."""
+    args = _parser().parse_args(argv)
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            _serve(args)
+        except BaseException as error:  # for the main thread
+            failed.append(error)
+
+    try:
+        # In a thread, so that a signal is heard at once, whatever is computed.
+        with signals.stoppable():
+            worker = threading.Thread(target=work, daemon=True)
+            worker.start()
+            while worker.is_alive():
+                worker.join(0.5)
+        if failed:
+            raise failed[0]
+    except InterruptedRun as error:
+        signals.say(f"stopped: {error}.")
+        return error.exit_code
+    except RunError as error:
+        if args.debug:
+            traceback.print_exc()
+        signals.say(f"error: {error}")
+        return error.exit_code
+    return 0
+
+
+def _serve(args: argparse.Namespace) -> None:
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    with robots.without_gl():
+        try:
+            from . import serve
+        except ImportError as error:
+            raise UsageError(
+                f"the page needs the extra jaxpets[play] ({error}); install it with: "
+                "pip install 'jaxpets[play]'"
+            ) from error
+
+        serve.serve(serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"}))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.play",
+        description="Opens a page in the browser: a robot does what it is asked.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add(
+        "--from", dest="source", default=_FROM, metavar="MODEL",
+        help="pretrained/NAME, the folder of a run, or a file of a model; by default "
+        f"{_FROM}",
+    )  # fmt: skip
+    add("--env", help="the robot; by default that of the model")
+    add("--seed", type=int, help="of a run with several; by default the first")
+    add(
+        "--watch", type=Path, metavar="RUN",
+        help="shows the last trial of a run, and its curves, while it explores",
+    )  # fmt: skip
+    add("--port", type=int, help="by default 8080, or any that is free")
+    add("--host", help="to listen at, as 0.0.0.0; by default this machine alone")
+    add("--no-open", action="store_true", help="opens no browser")
+    add("--debug", action="store_true", help="shows tracebacks")
+    return parser
+
+
+if __name__ == "__main__":
+    signals.program(main)

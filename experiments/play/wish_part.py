@@ -1,0 +1,116 @@
+"""The controls of a robot that plans: what is asked of it, and what it imagines."""
+
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from viser import uplot
+
+from jaxpets import formulas
+
+from . import report
+from .asking import EXPLORE
+from .history import Frame
+from .panel import AddButtons, write
+from .pilot import Inputs
+from .report import small
+from .scene import Look
+from .session import Session
+from .wishes import Language
+
+PROMISED, EARNED = "#0072b2", "#d55e00"
+_CURVE_SECONDS = 15.0
+
+
+class WishPart:
+    """Buttons, a line and sliders for what is wanted; curves of what came of it."""
+
+    def __init__(
+        self, gui: Any, add_buttons: AddButtons, language: Language, horizon: int
+    ) -> None:
+        self._gui, self._language, self._horizon = gui, language, horizon
+        tasks = list(language.tasks)
+        add_buttons("wish", "task", tasks, "The model was never trained for it.")
+        hint = "Seeks what its networks disagree about."
+        add_buttons("wish", "or", [EXPLORE], hint)
+        self._line = gui.add_text("reward", "", hint="Type what you want more of.")
+        self._under_line = gui.add_html("")
+        with gui.add_folder("Words for it", expand_by_default=False):
+            gui.add_html(_vocabulary(language))
+        with gui.add_folder("Or the motion that you want"):
+            self._add_motion()
+        with gui.add_folder("What it imagines"):
+            self._add_imagination()
+
+    @property
+    def look(self) -> Look:
+        """What of the imagination is to be seen."""
+        return Look(bool(self._paths.value), bool(self._ghosts.value))
+
+    def read(self, back: float) -> Inputs:
+        """Returns what the controls say, which may be anything."""
+        sliders = tuple(slider.value for slider in self._sliders)
+        return Inputs(self._line.value, sliders, self._effort.value, back)
+
+    def follow(self, said: Inputs) -> None:
+        """Has the line say what is asked for."""
+        if self._line.value != said.line:
+            self._line.value = said.line
+
+    def speak(self, session: Session, frame: Frame) -> None:
+        """Says what is asked for, what was promised, and what came."""
+        write(self._under_line, report.under_line(session.asked, self._language))
+        write(self._doubt, report.doubt(frame))
+        if session.back > 0:
+            return
+        step_time = session.stepper.step_time
+        found = report.curves(session.recent(), self._horizon, step_time)
+        most = max(np.nanmax(found.disagreement, initial=0.0), 1e-9)
+        share = np.nan_to_num(frame.disagreement) / most
+        self._bar.value = float(np.clip(100 * share, 0, 100))
+        shown = slice(-round(_CURVE_SECONDS / step_time), None)
+        curves = (found.seconds, found.promised, found.earned)
+        self._chart.data = tuple(curve[shown] for curve in curves)
+
+    def _add_motion(self) -> None:
+        self._sliders = [
+            self._gui.add_slider(
+                slider.word.replace("_", " "), slider.low, slider.high, slider.step,
+                min(max(0.0, slider.low), slider.high), hint=f"In {slider.unit}.",
+            )
+            for slider in self._language.sliders
+        ]  # fmt: skip
+        hint = "What a unit of it costs: the sum of the squares of the action."
+        self._effort = self._gui.add_slider(
+            "effort costs", 0.0, 1.0, 0.05, 0.1, hint=hint
+        )
+
+    def _add_imagination(self) -> None:
+        gui = self._gui
+        self._paths = gui.add_checkbox("paths", True, hint="A color for each network.")
+        hint = "Where it sees itself half way, and at the end."
+        self._ghosts = gui.add_checkbox("ghosts", True, hint=hint)
+        self._doubt = gui.add_html("")
+        self._bar = gui.add_progress_bar(0.0)
+        self._chart = gui.add_uplot(
+            (np.zeros(1), np.zeros(1), np.zeros(1)),
+            (
+                uplot.Series(label="s"),
+                uplot.Series(label="promised", stroke=PROMISED, width=2),
+                uplot.Series(label="earned", stroke=EARNED, width=2),
+            ),
+            title="return per step: promised, and as it came",
+            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
+            height=160,
+        )
+
+
+def _vocabulary(language: Language) -> str:
+    actions = [f"action_0 … action_{language.action_size - 1}"]
+    rows: Sequence[tuple[str, Sequence[str]]] = (
+        ("", [*language.words, "effort", *actions, "pi"]),
+        ("<br>functions: ", formulas.FUNCTIONS),
+        ("<br>signs: ", "+ - * / ** < <= > >= == != and or not".split()),
+    )
+    return small("".join(name + html.escape("  ".join(words)) for name, words in rows))
