@@ -142,17 +142,18 @@ def data_of(state: State) -> State:
     return jax.tree.map(lambda _: None, state)._replace(dataset=state.dataset)
 
 
-def data_template(leaves: Mapping[str, Any]) -> State:
+def data_template(leaves: Mapping[str, Any]) -> Any:
     """Returns the form of the dataset `[S]` of a checkpoint, of what its leaves are.
 
     With it the data are read without building what learns.
     """
 
-    def leaf(name: str) -> jax.ShapeDtypeStruct:
+    def leaf(name: str) -> Any:
         found = leaves[f"dataset/{name}"]
         return jax.ShapeDtypeStruct(tuple(found["shape"]), found["dtype"])
 
     fields = jaxpets.Transition._fields
     rows = jaxpets.Transition(*(leaf(f"data/{name}") for name in fields))
     dataset = jaxpets.typing.Dataset(rows, leaf("size"), leaf("cursor"))
-    return jaxpets.typing.LearnerState(None, None, dataset, None)  # pyright: ignore
+    nothing: Any = None
+    return jaxpets.typing.LearnerState(nothing, nothing, dataset, nothing)

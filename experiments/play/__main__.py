@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import sys
 import threading
 import traceback
 from collections.abc import Sequence
@@ -59,7 +58,9 @@ def _serve(args: argparse.Namespace) -> None:
                 "pip install 'jaxpets[play]'"
             ) from error
 
-        serve.serve(serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"}))
+        serve.serve(
+            serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"})
+        )
 
 
 def _parser() -> argparse.ArgumentParser:

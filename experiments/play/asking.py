@@ -1,6 +1,6 @@
-"""What is asked of the robot, and how it is said: buttons, sliders and a line of text."""
+"""What is asked of the robot, by buttons, sliders or a line of text."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxpets import formulas
 from jaxpets.envs import Robot
@@ -15,14 +15,14 @@ class Asked(NamedTuple):
     """A wish, and what the page says of it.
 
     Attributes:
-      wish: in force.
+      wish: in force; None where nothing may be asked for.
       name: of the task, "explore", or "" of what was typed.
       line: of text, as it stands on the page.
-      problem: why the line is no reward, "" if it is one; the wish is then an older one.
+      problem: why the line is no reward; the wish is then an older one. "" if it is.
       column: where in the line, from 0.
     """
 
-    wish: Wish
+    wish: Any
     name: str
     line: str
     problem: str = ""
@@ -32,6 +32,10 @@ class Asked(NamedTuple):
     def words(self) -> str:
         """What is wanted, in words."""
         return self.name or self.line
+
+
+NOTHING = Asked(None, "", "")
+"""Where nothing may be asked for."""
 
 
 def at_first(robot: Robot, language: Language, wish: Wish) -> Asked:

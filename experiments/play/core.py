@@ -99,7 +99,12 @@ def core(
             state = robot.task_reset(wish.task, key)
         else:
             state = env.reset(key)
-        return World(state, planner.init(), jnp.int32(0), _drawn(state, track(state.obs[None])[0]))
+        return World(
+            state,
+            planner.init(),
+            jnp.int32(0),
+            _drawn(state, track(state.obs[None])[0]),
+        )
 
     def think(params: Any, wish: Wish, key: Array, world: World) -> Thought:
         obs = world.env.obs
@@ -115,7 +120,9 @@ def core(
         # It starts where the robot is, also where that is not observed.
         ghosts = each + (world.qpos - each[:, :, :1])
         ghosts = jnp.where(jnp.isfinite(ghosts), ghosts, world.qpos)
-        return Thought(state, output.action, output.value / horizon, jnp.mean(spread), ghosts)
+        return Thought(
+            state, output.action, output.value / horizon, jnp.mean(spread), ghosts
+        )
 
     def act(
         wish: Wish, push: Array, world: World, thought: Thought

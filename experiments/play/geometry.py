@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from .meshes import UNIT
+
 _C: Any = mujoco  # its stubs lack half of it
 _HIDDEN_GROUP = 3  # from here on MuJoCo's own viewer shows no geom
-_SIDES = 20  # of what is round
 
 
 class Shape(NamedTuple):
@@ -47,11 +48,16 @@ class Pose(NamedTuple):
     center: np.ndarray
 
 
-def shapes(model: Any) -> list[Shape]:
+def shapes(model: Any, *, seamless: bool = False) -> list[Shape]:
     """Returns what is seen of a model but for its floor: one Shape per kind of mesh.
 
     A capsule is a cylinder between two spheres, so that few meshes do for all limbs.
     Fields of heights, and what its own viewer would not show, are left out.
+
+    Args:
+      model: a compiled MuJoCo model.
+      seamless: a capsule is one mesh, with ends that are a little too long; for what is
+        seen through.
     """
     copies: dict[Any, list[tuple[Any, ...]]] = {}
     for geom in range(model.ngeom):
@@ -59,14 +65,16 @@ def shapes(model: Any) -> list[Shape]:
         if color is None:
             continue
         own = (model.geom_pos[geom], model.geom_quat[geom])
-        for kind, offset, scale in _pieces(model, geom):
+        for kind, offset, scale in _pieces(model, geom, seamless):
             place = own[0] + _rotated(own[1], np.asarray(offset, float))
             row = (model.geom_bodyid[geom], place, own[1], scale, color)
             copies.setdefault(kind, []).append(row)
     found = []
     for kind, rows in copies.items():
-        bodies, positions, quaternions, scales, colors = map(np.array, zip(*rows))
-        mesh = _UNIT[kind]() if kind in _UNIT else _asset(model, kind)
+        bodies, positions, quaternions, scales, colors = map(
+            np.array, zip(*rows, strict=True)
+        )
+        mesh = UNIT[kind]() if kind in UNIT else _asset(model, kind)
         found.append(Shape(*mesh, bodies, positions, quaternions, scales, colors))
     return found
 
@@ -88,7 +96,9 @@ def poses(model: Any) -> Callable[[np.ndarray], Pose]:
             positions[i], quaternions[i] = data.xpos, data.xquat
             centers[i] = data.subtree_com[moving]
         lead = qpos.shape[:-1]
-        return Pose(*(x.reshape(*lead, *x.shape[1:]) for x in (positions, quaternions, centers)))
+        return Pose(
+            *(x.reshape(*lead, *x.shape[1:]) for x in (positions, quaternions, centers))
+        )
 
     return pose
 
@@ -102,7 +112,9 @@ def placed(shape: Shape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
     return positions.astype(np.float32), quaternions.astype(np.float32)
 
 
-def between(model: Any, first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
+def between(
+    model: Any, first: np.ndarray, second: np.ndarray, share: float
+) -> np.ndarray:
     """Returns the positions `[Q]` on the way from one to another, as joints move."""
     way, found = np.zeros(model.nv), np.array(first, np.float64)
     _C.mj_differentiatePos(model, way, 1.0, found, np.asarray(second, np.float64))
@@ -125,25 +137,24 @@ def _color(model: Any, geom: int) -> np.ndarray | None:
     return np.round(255 * np.clip(rgba[:3], 0, 1)).astype(np.uint8)
 
 
-def _pieces(model: Any, geom: int) -> list[tuple[Any, Any, Any]]:
+def _pieces(model: Any, geom: int, seamless: bool) -> list[tuple[Any, Any, Any]]:
     """Returns the kind, the offset and the scale of each piece of a geom."""
-    kinds, kind = _C.mjtGeom, model.geom_type[geom]
+    kinds, kind = _C.mjtGeom, int(model.geom_type[geom])
     a, b, c = map(float, model.geom_size[geom])
     here = (0.0, 0.0, 0.0)
-    if kind == kinds.mjGEOM_SPHERE:
-        return [("sphere", here, (a, a, a))]
-    if kind == kinds.mjGEOM_ELLIPSOID:
-        return [("sphere", here, (a, b, c))]
-    if kind == kinds.mjGEOM_BOX:
-        return [("box", here, (a, b, c))]
-    if kind == kinds.mjGEOM_CYLINDER:
-        return [("can", here, (a, a, b))]
-    if kind == kinds.mjGEOM_CAPSULE:
-        ends = [("sphere", (0.0, 0.0, end), (a, a, a)) for end in (-b, b)]
-        return [("tube", here, (a, a, b)), *ends]
-    if kind == kinds.mjGEOM_MESH:
-        return [(int(model.geom_dataid[geom]), here, (1.0, 1.0, 1.0))]
-    return []
+    ends = [("sphere", (0.0, 0.0, end), (a, a, a)) for end in (-b, b)]
+    capsule = [("pill", here, (a, a, a + b))]
+    found = {
+        int(kinds.mjGEOM_SPHERE): [("sphere", here, (a, a, a))],
+        int(kinds.mjGEOM_ELLIPSOID): [("sphere", here, (a, b, c))],
+        int(kinds.mjGEOM_BOX): [("box", here, (a, b, c))],
+        int(kinds.mjGEOM_CYLINDER): [("can", here, (a, a, b))],
+        int(kinds.mjGEOM_CAPSULE): capsule
+        if seamless
+        else [("tube", here, (a, a, b)), *ends],
+        int(kinds.mjGEOM_MESH): [(int(model.geom_dataid[geom]), here, (1.0, 1.0, 1.0))],
+    }
+    return found.get(kind, [])
 
 
 def _asset(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
@@ -153,67 +164,6 @@ def _asset(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
         np.array(model.mesh_vert[start : start + count]),
         np.array(model.mesh_face[first : first + faces]),
     )
-
-
-def _sphere() -> tuple[np.ndarray, np.ndarray]:
-    return _turned(np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1))
-
-
-def _turned(latitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the part of a unit sphere between the first and the last latitude."""
-    longitudes = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
-    lat, lon = np.meshgrid(latitudes, longitudes, indexing="ij")
-    rows = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
-    return np.stack(rows, -1).reshape(-1, 3), _quads(len(latitudes))
-
-
-def _tube() -> tuple[np.ndarray, np.ndarray]:
-    angles = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
-    ring = np.stack([np.cos(angles), np.sin(angles)], -1)
-    ends = [np.column_stack([ring, np.full(_SIDES, z)]) for z in (-1.0, 1.0)]
-    return np.concatenate(ends), _quads(2)
-
-
-def _can() -> tuple[np.ndarray, np.ndarray]:
-    """Returns a tube with lids, which have corners of their own for a sharp rim."""
-    sides, faces = _tube()
-    low, high = sides[:_SIDES], sides[_SIDES:]
-    i = np.arange(1, _SIDES - 1)
-    fan = np.column_stack([np.zeros_like(i), i, i + 1])
-    lids = [fan[:, ::-1] + 2 * _SIDES, fan + 3 * _SIDES]
-    return np.concatenate([sides, low, high]), np.concatenate([faces, *lids])
-
-
-def _box() -> tuple[np.ndarray, np.ndarray]:
-    """Returns a cube of half width one, whose sides share no corner."""
-    vertices, faces = [], []
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            side = np.insert(square, axis, sign, axis=1)
-            start = 4 * len(vertices)
-            # np.insert keeps the order of the other two axes; for y it is a mirror.
-            is_outward = (sign > 0) != (axis == 1)
-            order = [0, 1, 2, 0, 2, 3] if is_outward else [0, 2, 1, 0, 3, 2]
-            faces += [start + np.array(order).reshape(2, 3)]
-            vertices.append(side)
-    return np.concatenate(vertices), np.concatenate(faces)
-
-
-def _quads(rings: int) -> np.ndarray:
-    """Returns the faces between rings of corners, seen from outside."""
-    ring, i = np.meshgrid(np.arange(rings - 1), np.arange(_SIDES), indexing="ij")
-    a, b = ring * _SIDES + i, ring * _SIDES + (i + 1) % _SIDES
-    faces = [np.stack(x, -1).reshape(-1, 3) for x in ((a, b, b + _SIDES), (a, b + _SIDES, a + _SIDES))]
-    return np.concatenate(faces)
-
-
-_UNIT: dict[Any, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
-    "sphere": _sphere,
-    "tube": _tube,
-    "can": _can,
-    "box": _box,
-}
 
 
 def _rotated(quaternions: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -258,7 +208,11 @@ def _root_dof(model: Any, axis: int) -> int | None:
         if model.jnt_type[joint] == _C.mjtJoint.mjJNT_FREE:
             return dof + axis
         is_slide = model.jnt_type[joint] == _C.mjtJoint.mjJNT_SLIDE
-        if is_slide and not model.jnt_limited[joint] and model.jnt_axis[joint][axis] == 1:
+        if (
+            is_slide
+            and not model.jnt_limited[joint]
+            and model.jnt_axis[joint][axis] == 1
+        ):
             return dof
     return None
 

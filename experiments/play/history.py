@@ -54,7 +54,9 @@ class History:
         Raises:
           IndexError: before there is any.
         """
-        steps = min(round(max(seconds_ago, 0.0) / self._step_time), len(self._frames) - 1)
+        steps = min(
+            round(max(seconds_ago, 0.0) / self._step_time), len(self._frames) - 1
+        )
         return self._frames[-1 - max(steps, 0)]
 
     def drop_after(self, frame: Frame) -> None:

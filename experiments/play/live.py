@@ -20,12 +20,14 @@ class Stepper(Protocol):
 
     Attributes:
       step_time: of a step, in s.
-      pushes: names of the pushes that there are, and the velocities `[V]` that each
-        adds.
     """
 
     step_time: float
-    pushes: Mapping[str, np.ndarray]
+
+    @property
+    def pushes(self) -> Mapping[str, np.ndarray]:
+        """Names of the pushes that there are, and the velocities `[V]` each adds."""
+        ...
 
     def start(self, asked: Asked) -> Frame:
         """Returns the first frame of a new trial."""
@@ -59,7 +61,10 @@ class Live:
         # Compiled now, while somebody is told so.
         frame, _ = self._stepped(world, asked, None)
         return frame._replace(
-            number=0, qpos=np.asarray(world.qpos), obs=np.asarray(world.env.obs), world=world
+            number=0,
+            qpos=np.asarray(world.qpos),
+            obs=np.asarray(world.env.obs),
+            world=world,
         )
 
     def step(self, frame: Frame, asked: Asked, push: str | None) -> tuple[Frame, str]:

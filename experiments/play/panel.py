@@ -19,11 +19,15 @@ Save = Callable[[str, float, viser.ClientHandle], None]
 
 
 class Part(Protocol):
-    """What is between the head of the panel and its clock: that of a kind of page."""
+    """What is on the panel beside the clock: that of a kind of page."""
 
     @property
     def look(self) -> Look:
         """What of the imagination is to be seen."""
+        ...
+
+    def add_below(self) -> None:
+        """Adds what stands below the clock; the rest is there before."""
         ...
 
     def read(self, back: float) -> Inputs:
@@ -60,10 +64,12 @@ class Panel:
         )
         gui.set_panel_label(title)
         gui.main_panel.dock_right()
+        gui.main_panel.set_width(360)
         self._status = gui.add_html(report.small("It is about to begin."))
         self._readings = gui.add_html("")
         self.part = make_part(gui, self._add_buttons)
         self._add_time(pushes)
+        self.part.add_below()
         self._add_memory()
 
     # For the thread of the world.

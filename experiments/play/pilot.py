@@ -1,4 +1,4 @@
-"""From the controls of a page to orders for the world. It knows no page: values come in.
+"""From the controls of a page to orders for the world; it knows no page, only values.
 
 Controls are looked at once a step, however often they change, and what comes over a
 socket is taken for what it may be: anything.

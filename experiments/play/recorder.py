@@ -1,5 +1,6 @@
 """What was seen, as a file to keep: a video, or a page that needs no server."""
 
+import itertools
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 
 from jaxpets.envs import Robot
 
+from ..storage import trajectories
 from ..tools import video
 from . import geometry
 from .history import Frame
@@ -17,7 +19,7 @@ from .server import serving
 _BETWEEN = 2  # pictures per step, so that it moves smoothly
 
 
-def html(robot: Robot, frames: Sequence[Frame], look: Look = Look()) -> bytes:
+def html(robot: Robot, frames: Sequence[Frame], look: Look) -> bytes:
     """Returns one HTML file that replays frames in 3D, without a server.
 
     Args:
@@ -29,7 +31,7 @@ def html(robot: Robot, frames: Sequence[Frame], look: Look = Look()) -> bytes:
         scene = Scene(server, robot.model)
         scene.show(frames[0].qpos, frames[0], look)
         recording = server.get_scene_serializer()
-        for before, after in zip(frames[:-1], frames[1:], strict=True):
+        for before, after in itertools.pairwise(frames):
             for i in range(_BETWEEN):
                 recording.insert_sleep(robot.step_time / _BETWEEN)
                 share = (i + 1) / _BETWEEN if after.number > before.number else 1.0
@@ -52,6 +54,6 @@ def mp4(env: str, frames: Sequence[Frame]) -> bytes:
     seen = {"obs": obs, "seeds": np.array([0]), "tasks": np.array(["seen"])}
     with tempfile.TemporaryDirectory(prefix="jaxpets-play-") as folder:
         source, target = Path(folder, "seen.npz"), Path(folder, "seen.mp4")
-        np.savez(target.with_name(source.name), **seen)
+        trajectories.save(source, seen)
         video.render(source, target, task="seen", seed=0, trial=1, env=env)
         return target.read_bytes()

@@ -88,7 +88,9 @@ def under_line(asked: Asked, language: Language) -> str:
     """Returns what stands under the line of text, as HTML: all of it is escaped."""
     if asked.problem:
         where = asked.line[: asked.column] + "▸" + asked.line[asked.column :]
-        text = f"{html.escape(asked.problem)}<br><code>{html.escape(where[:200])}</code>"
+        text = (
+            f"{html.escape(asked.problem)}<br><code>{html.escape(where[:200])}</code>"
+        )
         return small(text, "#c92a2a")
     if asked.name == EXPLORE:
         text = "It seeks what its networks disagree about."

@@ -38,6 +38,9 @@ class RunPart:
             self._error = _chart(gui, "error of the model", ["squared"])
             self._returns = _chart(gui, "what the tasks would have earned", tasks)
 
+    def add_below(self) -> None:
+        """Adds nothing."""
+
     def read(self, back: float) -> Inputs:
         """Returns how far back is looked."""
         return Inputs("", (), 0.0, back)

@@ -4,7 +4,6 @@ The world moves and the robot stays in the middle, so that everybody may look at
 where they like, and a recording follows it too.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +37,7 @@ class Scene:
         self._model = model
         self._poses = geometry.poses(model)
         self._shapes = geometry.shapes(model)
+        self._ghost_shapes = geometry.shapes(model, seamless=True)
         self._server = server
         self._size = geometry.size(model)
         self._is_roaming = geometry.is_roaming(model)
@@ -56,7 +56,7 @@ class Scene:
         self._paths: Any = None
         self._aim(rest)
 
-    def show(self, qpos: np.ndarray, frame: Frame, look: Look = Look()) -> None:
+    def show(self, qpos: np.ndarray, frame: Frame, look: Look) -> None:
         """Shows a robot where it is, and what was imagined in a frame."""
         pose = self._poses(qpos)
         middle = np.append(pose.center[:2], 0.0) if self._is_roaming else np.zeros(3)
@@ -67,7 +67,11 @@ class Scene:
                 )
             self._world.position = -middle
             self._ground.pass_by(middle)
-            if self._drawn is None or self._drawn[0] is not frame or self._drawn[1] != look:
+            if (
+                self._drawn is None
+                or self._drawn[0] is not frame
+                or self._drawn[1] != look
+            ):
                 self._drawn = frame, look
                 self._imagine(frame, look)
 
@@ -101,7 +105,7 @@ class Scene:
     def _draw_ghosts(self, pose: Pose, colors: np.ndarray) -> None:
         """Draws G robots, see-through, in G colors."""
         first = not self._ghosts
-        for i, shape in enumerate(self._shapes):
+        for i, shape in enumerate(self._ghost_shapes):
             positions, quaternions = geometry.placed(shape, pose)
             flat = (quaternions.reshape(-1, 4), positions.reshape(-1, 3))
             count = len(shape.bodies)
@@ -122,7 +126,7 @@ class Scene:
         height = float(pose.center[2])
         middle = np.append(np.zeros(2) if self._is_roaming else pose.center[:2], height)
         camera.look_at = middle
-        camera.position = middle + size * np.array([0.5, -4.2, 1.3])
+        camera.position = middle + size * np.array([0.5, -3.8, 1.2])
         camera.fov = 0.75
 
 
@@ -138,9 +142,9 @@ class _Ground:
             return
         self._floor = scene.add_grid(
             "/floor", infinite_grid=True, cell_size=0.5, section_size=1.0,
-            cell_color=(205, 212, 220), section_color=(150, 160, 172),
-            cell_thickness=1.0, section_thickness=1.6,
-            plane_color=(232, 236, 241), plane_opacity=1.0, shadow_opacity=0.35,
+            cell_color=(222, 226, 230), section_color=(196, 202, 210),
+            cell_thickness=1.0, section_thickness=1.4,
+            plane_color=(233, 236, 240), plane_opacity=1.0, shadow_opacity=0.4,
             fade_distance=25 * size, fade_strength=1.2,
         )  # fmt: skip
         for i in range(2 * _MARKS + 1):
@@ -163,7 +167,7 @@ class _Ground:
             if self._numbers[place] != number:
                 self._numbers[place] = number
                 mark.text = f"{number * _MARK_GAP} m"
-            mark.position = (number * _MARK_GAP - x, 1.0 - y % 1.0, self._height)
+            mark.position = (number * _MARK_GAP - x, -1.0 - y % 1.0, self._height)
 
 
 def _copies(scene: Any, name: str, shape: Shape, pose: Pose) -> Any:
@@ -179,6 +183,7 @@ def _light(scene: Any) -> None:
     """Lights the middle, where the robot is: a sun that casts shadows, and the sky."""
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(None)
+    scene.set_background_image(_sky(), format="png")
     scene.add_light_hemisphere(
         "/lights/sky", sky_color=(255, 255, 255), ground_color=(190, 180, 170),
         intensity=1.3,
@@ -186,3 +191,10 @@ def _light(scene: Any) -> None:
     scene.add_light_directional(
         "/lights/sun", intensity=2.6, cast_shadow=True, position=(-0.5, -1.2, 2.5)
     )
+
+
+def _sky() -> np.ndarray:
+    """Returns a picture `[H, 1, 3]` that gets lighter towards the horizon."""
+    share = np.linspace(0, 1, 64)[:, None, None] ** 0.7
+    top, bottom = np.array([201, 218, 238.0]), np.array([255, 255, 255.0])
+    return np.round((1 - share) * top + share * bottom).astype(np.uint8)

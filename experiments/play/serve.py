@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import viser
 
+from jaxpets.envs import Robot
+
 from .. import build
 from ..errors import UsageError
 from . import asking, source, wishes
@@ -63,13 +65,29 @@ def serve(options: Options, is_over: threading.Event | None = None) -> None:
             session, page = make(server, options)
             if not options.no_open and _has_display():
                 webbrowser.open(gate.address)
-            world = threading.Thread(target=session.run, args=(page.steer,), daemon=True)
-            world.start()
-            page.run(is_over.wait)
-            session.stop()
-            world.join()
+            _run(session, page, is_over)
         finally:
             gate.close()
+
+
+def _run(session: Session, page: Page, is_over: threading.Event) -> None:
+    """Runs the world beside the page until it is over, or the world cannot begin."""
+    failed: list[Exception] = []
+
+    def run() -> None:
+        try:
+            session.run(page.steer)
+        except Exception as error:
+            failed.append(error)
+            is_over.set()
+
+    world = threading.Thread(target=run, daemon=True)
+    world.start()
+    page.run(is_over.wait)
+    session.stop()
+    world.join()
+    if failed:
+        raise failed[0]
 
 
 def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
@@ -89,7 +107,7 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     page = Page(
         server, robot, options.env or robot.name, session,
         lambda gui, add: WishPart(gui, add, language, horizon),
-        partial(Pilot, robot, language), f"{robot.name}, {found.title}",
+        partial(Pilot, robot, language), _title(robot, found.title),
     )  # fmt: skip
     return session, page
 
@@ -100,13 +118,17 @@ def _watching(server: viser.ViserServer, options: Options) -> tuple[Session, Pag
     run = Watched(options.watch, env=options.env, seed=options.seed)
     robot, replay = run.robot, Replay(run)
     nothing = Language({}, {}, (), 0)
-    session = Session(replay, asking.Asked(None, "", ""))
+    session = Session(replay, asking.NOTHING)
     page = Page(
         server, robot, run.env, session,
         lambda gui, add: RunPart(gui, add, run, replay),
-        partial(Pilot, None, nothing), f"{robot.name}, {options.watch.name}",
+        partial(Pilot, None, nothing), _title(robot, options.watch.name),
     )  # fmt: skip
     return session, page
+
+
+def _title(robot: Robot, of: str) -> str:
+    return f"{robot.name.rpartition('/')[2]}: {of}"
 
 
 class _Open(NamedTuple):
@@ -146,7 +168,8 @@ def keep_programs() -> None:
 
     To load a program is to run it: where others may write, nothing is kept.
     """
-    if jax.config.jax_compilation_cache_dir:
+    config: Any = jax.config
+    if config.jax_compilation_cache_dir:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(home, "jaxpets", "programs")
@@ -158,7 +181,6 @@ def keep_programs() -> None:
     others = stat.S_IWGRP | stat.S_IWOTH
     if found.st_uid != os.getuid() or found.st_mode & others:
         return
-    config: Any = jax.config
     config.update("jax_compilation_cache_dir", str(folder))
     config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 

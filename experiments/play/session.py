@@ -74,7 +74,12 @@ class Session:
 
         Args:
           steer: called before every step; reads controls and gives orders.
+
+        Raises:
+          Exception: if it cannot begin.
         """
+        self.restart()
+        self.notice = ""
         while not self._stopped.is_set():
             try:
                 self.tick(steer)
@@ -138,9 +143,6 @@ class Session:
 
     def tick(self, steer: Callable[["Session"], None]) -> None:
         """Waits until a step is due, obeys, and steps."""
-        if self.shown is None:
-            self.restart()
-            self.notice = ""
         if self.is_paused:
             self._stopped.wait(_IDLE)
             self.clock.restart()

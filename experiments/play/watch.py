@@ -78,6 +78,7 @@ class Replay:
         self.step_time = run.robot.step_time
         self.trial = 0
         self._run = run
+        assert run.robot.qpos_fn is not None
         self._track = jax.jit(run.robot.qpos_fn)
         self._frames = [self._rest()]
 
@@ -103,7 +104,9 @@ class Replay:
         positions = np.asarray(self._track(obs))
         rest = np.asarray(self._run.robot.model.qpos0, np.float32)
         positions = np.where(np.isfinite(positions), positions, rest)
-        return [_frame(i, *row) for i, row in enumerate(zip(positions, obs, strict=True))]
+        return [
+            _frame(i, *row) for i, row in enumerate(zip(positions, obs, strict=True))
+        ]
 
     def _rest(self) -> Frame:
         robot = self._run.robot

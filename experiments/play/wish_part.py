@@ -1,7 +1,6 @@
 """The controls of a robot that plans: what is asked of it, and what it imagines."""
 
 import html
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,10 @@ class WishPart:
             gui.add_html(_vocabulary(language))
         with gui.add_folder("Or the motion that you want"):
             self._add_motion()
-        with gui.add_folder("What it imagines"):
+
+    def add_below(self) -> None:
+        """Adds what it imagines."""
+        with self._gui.add_folder("What it imagines"):
             self._add_imagination()
 
     @property
@@ -107,10 +109,9 @@ class WishPart:
 
 
 def _vocabulary(language: Language) -> str:
-    actions = [f"action_0 … action_{language.action_size - 1}"]
-    rows: Sequence[tuple[str, Sequence[str]]] = (
-        ("", [*language.words, "effort", *actions, "pi"]),
-        ("<br>functions: ", formulas.FUNCTIONS),
-        ("<br>signs: ", "+ - * / ** < <= > >= == != and or not".split()),
-    )
-    return small("".join(name + html.escape("  ".join(words)) for name, words in rows))
+    """Returns what may stand in a reward, as HTML."""
+    last = f"action_{language.action_size - 1}"
+    words = [*language.words, "effort", "action_0", "...", last, "pi"]
+    signs = "+ - * / ** < <= > >= == != and or not"
+    rows = ("  ".join(words), "  ".join(formulas.FUNCTIONS), signs)
+    return small("<br>".join(map(html.escape, rows)))

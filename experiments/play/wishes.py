@@ -97,7 +97,7 @@ def reward_of(robot: Robot) -> jaxpets.typing.RewardFn:
 
 
 def earned_of(robot: Robot) -> jaxpets.typing.RewardFn:
-    """Returns what a real step `[D]` earns: NaN of disagreement, which it has none of."""
+    """Returns what a real step `[D]` earns; NaN where disagreement is sought."""
 
     def earned(wish: Wish, obs: Array, action: Array, next_obs: Array) -> Array:
         step = (obs, action, next_obs)
@@ -120,7 +120,8 @@ def first(robot: Robot, params: jaxpets.EnsembleParams) -> Wish:
     """Returns the wish for the first task of a robot."""
     nothing = formulas.parse("0", {})
     base = rewards.max_variance(params)
-    return for_task(Wish(jnp.int32(TASK), (), nothing, base), robot, robot.tasks.names[0])
+    nobody = Wish(jnp.int32(TASK), (), nothing, base)
+    return for_task(nobody, robot, robot.tasks.names[0])
 
 
 def for_task(wish: Wish, robot: Robot, name: str) -> Wish:
@@ -150,8 +151,9 @@ def language_of(robot: Robot, params: jaxpets.EnsembleParams) -> Language:
     rows = robot.env.coordinates
     aliases = {axis.name: axis.entry for axis in robot.axes}
     places = {row.name: place for place, row in enumerate(rows)}
-    height = [places[name] for name in _HEIGHTS if name in places][:1]
-    aliases |= {"height": place for place in height if "height" not in aliases}
+    heights = [places[name] for name in _HEIGHTS if name in places]
+    if heights and "height" not in aliases:
+        aliases["height"] = heights[0]
     words = formulas.names(rows, aliases)
     units = {axis.name: axis.unit for axis in robot.axes}
     low, high = np.asarray(params.scaler.low), np.asarray(params.scaler.high)
@@ -173,7 +175,7 @@ def language_of(robot: Robot, params: jaxpets.EnsembleParams) -> Language:
 def said_by_sliders(
     sliders: tuple[Slider, ...], values: tuple[float, ...], effort: float
 ) -> str:
-    """Returns the formula of what the sliders ask for: to be as near to it as can be."""
+    """Returns the formula of what sliders ask for: to be as near to it as can be."""
     terms: list[str] = []
     for slider, value in zip(sliders, values, strict=True):
         weight = "" if slider.weight == 1 else f"{slider.weight:g} * "
