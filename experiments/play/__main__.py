@@ -84,6 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--port", type=int, help="by default 8080, or any that is free")
     add("--host", help="to listen at, as 0.0.0.0; by default this machine alone")
+    add("--fps", type=float, default=50.0, help="pictures a second, 50 by default")
     add("--no-open", action="store_true", help="opens no browser")
     add("--debug", action="store_true", help="shows tracebacks")
     return parser

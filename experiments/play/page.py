@@ -18,7 +18,6 @@ from .pilot import Pilot
 from .scene import Scene
 from .session import MEMORY, Session
 
-_RATE = 50.0  # pictures a second
 _WORDS_RATE = 5.0
 
 
@@ -59,14 +58,15 @@ class Page:
         said = self._pilot.steer(session, self._panel.read(), self._panel.events())
         self._panel.follow(said)
 
-    def run(self, is_over: Callable[[float], bool]) -> None:
+    def run(self, is_over: Callable[[float], bool], rate: float) -> None:
         """Shows what there is to be shown.
 
         Args:
           is_over: waits for so many s, and returns whether to end.
+          rate: pictures a second.
         """
         words_at = 0.0
-        while not is_over(1 / _RATE):
+        while not is_over(1 / rate):
             now = time.monotonic()
             try:
                 self._show(now)

@@ -7,6 +7,7 @@ import stat
 import sys
 import threading
 import webbrowser
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,15 +44,25 @@ class Options(NamedTuple):
     watch: Path | None = None
     port: int | None = None
     host: str | None = None
+    fps: float = 50.0
     no_open: bool = False
 
 
-def serve(options: Options, is_over: threading.Event | None = None) -> None:
+def _say(address: str) -> None:
+    print(f"open {address} (Ctrl-C ends it)", flush=True)
+
+
+def serve(
+    options: Options,
+    is_over: threading.Event | None = None,
+    tell: Callable[[str], None] = _say,
+) -> None:
     """Serves a page.
 
     Args:
       options: of the command line.
       is_over: ends it; None serves for ever.
+      tell: gets the address, once it is open.
 
     Raises:
       RunError: if there is no such model or run, or the address is not to be had.
@@ -60,17 +71,20 @@ def serve(options: Options, is_over: threading.Event | None = None) -> None:
     keep_programs()
     with serving() as server:
         gate = _opened(options, server.get_port())
+        tell(gate.address)
         try:
             make = _live if options.watch is None else _watching
             session, page = make(server, options)
             if not options.no_open and _has_display():
                 webbrowser.open(gate.address)
-            _run(session, page, is_over)
+            _run(session, page, is_over, options.fps)
         finally:
             gate.close()
 
 
-def _run(session: Session, page: Page, is_over: threading.Event) -> None:
+def _run(
+    session: Session, page: Page, is_over: threading.Event, fps: float
+) -> None:
     """Runs the world beside the page until it is over, or the world cannot begin."""
     failed: list[Exception] = []
 
@@ -83,7 +97,7 @@ def _run(session: Session, page: Page, is_over: threading.Event) -> None:
 
     world = threading.Thread(target=run, daemon=True)
     world.start()
-    page.run(is_over.wait)
+    page.run(is_over.wait, fps)
     session.stop()
     world.join()
     if failed:
@@ -159,7 +173,6 @@ def _opened(options: Options, behind: int) -> _Open:
         gate = Gate(host, 0, behind, token)
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     address = f"http://{name}:{gate.port}/" + (f"{token}/" if token else "")
-    print(f"open {address} (Ctrl-C ends it)", flush=True)
     return _Open(gate, address)
 
 
