@@ -58,9 +58,12 @@ def _serve(args: argparse.Namespace) -> None:
                 "pip install 'jaxpets[play]'"
             ) from error
 
-        serve.serve(
-            serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"})
-        )
+        options = serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"})
+        serve.serve(options, threading.Event(), _tell)
+
+
+def _tell(address: str) -> None:
+    print(f"open {address} (Ctrl-C ends it)", flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,8 +87,6 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--port", type=int, help="by default 8080, or any that is free")
     add("--host", help="to listen at, as 0.0.0.0; by default this machine alone")
-    add("--fps", type=float, default=50.0, help="pictures a second, 50 by default")
-    add("--no-open", action="store_true", help="opens no browser")
     add("--debug", action="store_true", help="shows tracebacks")
     return parser
 

@@ -14,7 +14,7 @@ import jaxpets
 from jaxpets import rewards
 from jaxpets.envs import Robot
 
-from .wishes import Wish, bound, earned_of, reward_of
+from .reward import RewardChoice, bound, earned_of, reward_of
 
 
 class World(NamedTuple):
@@ -33,13 +33,13 @@ class World(NamedTuple):
     qpos: Array
 
 
-class Thought(NamedTuple):
-    """A plan.
+class Plan(NamedTuple):
+    """A plan, and what it leads to.
 
     Attributes:
       planner: the state of the search after it.
       action: `[A]`, to execute.
-      promise: `[]`, the return that it foresees, per step.
+      promised: `[]`, the return that it foresees, per step.
       disagreement: `[]`, of the members about where it leads, in the units of the
         model's own noise: the mean over its steps.
       ghosts: `[E, P, H+1, Q]`, where each particle goes, as it is drawn.
@@ -47,7 +47,7 @@ class Thought(NamedTuple):
 
     planner: Any
     action: Array
-    promise: Array
+    promised: Array
     disagreement: Array
     ghosts: Array
 
@@ -56,17 +56,17 @@ class Core(NamedTuple):
     """Pure functions, to be jitted.
 
     Attributes:
-      start: `(Wish, key) -> World`.
-      think: `(EnsembleParams, Wish, key, World) -> Thought`.
-      act: `(Wish, push [V], World, Thought) -> (World, reward [], has ended [])`; the
-        push is added to the velocities first.
+      start: `(RewardChoice, key) -> World`.
+      plan: `(EnsembleParams, RewardChoice, key, World) -> Plan`.
+      step: `(RewardChoice, push [V], World, Plan) -> (World, reward [], has ended [])`;
+        the push is added to the velocities first.
       push_size: V; 0 where the physics cannot be pushed.
       horizon: H.
     """
 
-    start: Callable[[Wish, Array], World]
-    think: Callable[[Any, Wish, Array, World], Thought]
-    act: Callable[[Wish, Array, World, Thought], tuple[World, Array, Array]]
+    start: Callable[[RewardChoice, Array], World]
+    plan: Callable[[Any, RewardChoice, Array, World], Plan]
+    step: Callable[[RewardChoice, Array, World, Plan], tuple[World, Array, Array]]
     push_size: int
     horizon: int
 
@@ -79,67 +79,55 @@ def core(
     horizon: int,
     terminal_fn: Callable[[Any, Array], Array] | None = None,
 ) -> Core:
-    """Builds the core of a page about one robot.
-
-    Args:
-      robot: with `model` and `qpos_fn`.
-      rollout: imagines.
-      search: of plans.
-      horizon: H, of the search.
-      terminal_fn: as `jaxpets.plan` takes it.
-    """
+    """Builds the core of a page about one robot, which has a `qpos_fn`."""
     reward, earned = reward_of(robot), earned_of(robot)
     planner = jaxpets.plan(rollout, reward, search, terminal_fn=terminal_fn)
     track = robot.qpos_fn
     assert track is not None
 
-    def start(wish: Wish, key: Array) -> World:
+    def start(choice: RewardChoice, key: Array) -> World:
         env = robot.env
         if robot.task_reset is not None:
-            state = robot.task_reset(wish.task, key)
+            state = robot.task_reset(choice.task, key)
         else:
             state = env.reset(key)
-        return World(
-            state,
-            planner.init(),
-            jnp.int32(0),
-            _drawn(state, track(state.obs[None])[0]),
-        )
+        qpos = _drawn(state, track(state.obs[None])[0])
+        return World(state, planner.init(), jnp.int32(0), qpos)
 
-    def think(params: Any, wish: Wish, key: Array, world: World) -> Thought:
+    def plan(params: Any, choice: RewardChoice, key: Array, world: World) -> Plan:
         obs = world.env.obs
-        wish = bound(wish, world.env.constants)
+        choice = bound(choice, world.env.constants)
         plan_key, ghost_key = jax.random.split(jax.random.fold_in(key, world.number))
-        known = jaxpets.PlanParams(params, wish)
+        known = jaxpets.PlanParams(params, choice)
         output, state = planner.step(known, plan_key, world.planner, obs)
         path = rollout(params, ghost_key, obs, output.actions[None])[0]
         spread = jax.vmap(rewards.epistemic, (None, 0, 0, 0))(
-            wish.base, path[:-1], output.actions, path[1:]
+            choice.base, path[:-1], output.actions, path[1:]
         )
         each = jax.vmap(jax.vmap(track, 1), 1)(path)  # [E, P, H+1, Q]
         # It starts where the robot is, also where that is not observed.
         ghosts = each + (world.qpos - each[:, :, :1])
         ghosts = jnp.where(jnp.isfinite(ghosts), ghosts, world.qpos)
-        return Thought(
+        return Plan(
             state, output.action, output.value / horizon, jnp.mean(spread), ghosts
         )
 
-    def act(
-        wish: Wish, push: Array, world: World, thought: Thought
+    def step(
+        choice: RewardChoice, push: Array, world: World, plan: Plan
     ) -> tuple[World, Array, Array]:
         before = _pushed(world.env, push)
-        state = robot.env.step(before, thought.action)
-        wish = bound(wish, state.constants)
-        reward = earned(wish, world.env.obs, thought.action, state.obs)
+        state = robot.env.step(before, plan.action)
+        choice = bound(choice, state.constants)
+        reward = earned(choice, world.env.obs, plan.action, state.obs)
         steps = track(jnp.stack([world.env.obs, state.obs]))
         qpos = _drawn(state, world.qpos + steps[1] - steps[0])
         ends = robot.env.terminal_fn
         ended = jnp.zeros((), bool) if ends is None else ends(state.obs)
-        return World(state, thought.planner, world.number + 1, qpos), reward, ended
+        return World(state, plan.planner, world.number + 1, qpos), reward, ended
 
     shape = jax.eval_shape(robot.env.reset, jax.random.key(0))
     size = shape.physics.qvel.shape[0] if hasattr(shape.physics, "qvel") else 0
-    return Core(start, think, act, size, horizon)
+    return Core(start, plan, step, size, horizon)
 
 
 def _drawn(state: jaxpets.EnvState, tracked: Array) -> Array:

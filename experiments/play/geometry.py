@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-
-from .meshes import UNIT
+from trimesh import creation
+from viser.transforms import SO3
 
 _C: Any = mujoco  # its stubs lack half of it
 _HIDDEN_GROUP = 3  # from here on MuJoCo's own viewer shows no geom
@@ -66,7 +66,7 @@ def shapes(model: Any, *, seamless: bool = False) -> list[Shape]:
             continue
         own = (model.geom_pos[geom], model.geom_quat[geom])
         for kind, offset, scale in _pieces(model, geom, seamless):
-            place = own[0] + _rotated(own[1], np.asarray(offset, float))
+            place = own[0] + SO3(own[1]) @ np.array([0.0, 0.0, offset])
             row = (model.geom_bodyid[geom], place, own[1], scale, color)
             copies.setdefault(kind, []).append(row)
     found = []
@@ -74,7 +74,7 @@ def shapes(model: Any, *, seamless: bool = False) -> list[Shape]:
         bodies, positions, quaternions, scales, colors = map(
             np.array, zip(*rows, strict=True)
         )
-        mesh = UNIT[kind]() if kind in UNIT else _asset(model, kind)
+        mesh = _asset(model, kind) if isinstance(kind, int) else _unit(kind)
         found.append(Shape(*mesh, bodies, positions, quaternions, scales, colors))
     return found
 
@@ -105,10 +105,9 @@ def poses(model: Any) -> Callable[[np.ndarray], Pose]:
 
 def placed(shape: Shape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
     """Returns where the copies of a shape are: `[..., N, 3]` and `[..., N, 4]`."""
-    carried = pose.quaternions[..., shape.bodies, :]
-    offset = _rotated(carried, shape.positions)
-    positions = pose.positions[..., shape.bodies, :] + offset
-    quaternions = _product(carried, shape.quaternions)
+    carried = SO3(pose.quaternions[..., shape.bodies, :])
+    positions = pose.positions[..., shape.bodies, :] + carried @ shape.positions
+    quaternions = carried.multiply(SO3(shape.quaternions)).wxyz
     return positions.astype(np.float32), quaternions.astype(np.float32)
 
 
@@ -137,24 +136,34 @@ def _color(model: Any, geom: int) -> np.ndarray | None:
     return np.round(255 * np.clip(rgba[:3], 0, 1)).astype(np.uint8)
 
 
-def _pieces(model: Any, geom: int, seamless: bool) -> list[tuple[Any, Any, Any]]:
-    """Returns the kind, the offset and the scale of each piece of a geom."""
+def _pieces(model: Any, geom: int, seamless: bool) -> list[tuple[Any, float, Any]]:
+    """Returns the kind, the offset along z and the scale of each piece of a geom."""
     kinds, kind = _C.mjtGeom, int(model.geom_type[geom])
     a, b, c = map(float, model.geom_size[geom])
-    here = (0.0, 0.0, 0.0)
-    ends = [("sphere", (0.0, 0.0, end), (a, a, a)) for end in (-b, b)]
-    capsule = [("pill", here, (a, a, a + b))]
+    capsule = [("pill", 0.0, (a, a, a + b))]
+    if not seamless:
+        capsule = [("can", 0.0, (a, a, b))]
+        capsule += [("sphere", end, (a, a, a)) for end in (-b, b)]
     found = {
-        int(kinds.mjGEOM_SPHERE): [("sphere", here, (a, a, a))],
-        int(kinds.mjGEOM_ELLIPSOID): [("sphere", here, (a, b, c))],
-        int(kinds.mjGEOM_BOX): [("box", here, (a, b, c))],
-        int(kinds.mjGEOM_CYLINDER): [("can", here, (a, a, b))],
-        int(kinds.mjGEOM_CAPSULE): capsule
-        if seamless
-        else [("tube", here, (a, a, b)), *ends],
-        int(kinds.mjGEOM_MESH): [(int(model.geom_dataid[geom]), here, (1.0, 1.0, 1.0))],
+        int(kinds.mjGEOM_SPHERE): [("sphere", 0.0, (a, a, a))],
+        int(kinds.mjGEOM_ELLIPSOID): [("sphere", 0.0, (a, b, c))],
+        int(kinds.mjGEOM_BOX): [("box", 0.0, (a, b, c))],
+        int(kinds.mjGEOM_CYLINDER): [("can", 0.0, (a, a, b))],
+        int(kinds.mjGEOM_CAPSULE): capsule,
+        int(kinds.mjGEOM_MESH): [(int(model.geom_dataid[geom]), 0.0, (1.0, 1.0, 1.0))],
     }
     return found.get(kind, [])
+
+
+def _unit(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a mesh between -1 and 1; a pill is a capsule that is much too thick."""
+    mesh = {
+        "sphere": lambda: creation.uv_sphere(count=[12, 24]),
+        "box": lambda: creation.box(extents=(2, 2, 2)).smooth_shaded,
+        "can": lambda: creation.cylinder(1, 2, sections=24).smooth_shaded,
+        "pill": lambda: creation.capsule(8, 1, count=[12, 24]),
+    }[kind]()
+    return mesh.vertices / np.abs(mesh.bounds).max(0), mesh.faces
 
 
 def _asset(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
@@ -166,60 +175,42 @@ def _asset(model: Any, mesh: int) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _rotated(quaternions: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Rotates vectors `[..., 3]` by quaternions `[..., 4]`."""
-    w, axis = quaternions[..., :1], quaternions[..., 1:]
-    t = 2 * np.cross(axis, vectors)
-    return vectors + w * t + np.cross(axis, t)
-
-
-def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns quaternion products `[..., 4]`: the second rotation, then the first."""
-    w, v = first[..., :1], first[..., 1:]
-    w2, v2 = second[..., :1], second[..., 1:]
-    scalar = w * w2 - np.sum(v * v2, -1, keepdims=True)
-    return np.concatenate([scalar, w * v2 + w2 * v + np.cross(v, v2)], -1)
-
-
 def pushes(model: Any) -> dict[str, np.ndarray]:
     """Returns velocities `[V]` to add to those of a robot, by a name for each.
 
     Of the root, where it moves freely along x or z; else of the first joint.
     """
-    found = {}
+    dofs, units = _root_dofs(model), np.eye(model.nv, dtype=np.float32)
     speed = 1.5 * np.sqrt(9.81 * max(float(model.stat.meansize), 0.1))
+    if not dofs:
+        dofs, speed = {0: 0}, 2.0
     directions = {"push back": (0, -speed), "push on": (0, speed), "toss": (2, speed)}
-    for name, (axis, value) in directions.items():
-        dof = _root_dof(model, axis)
-        if dof is not None:
-            found[name] = value * np.eye(model.nv, dtype=np.float32)[dof]
-    if not found and model.nv:
-        kick = np.eye(model.nv, dtype=np.float32)[0]
-        found = {"push back": -2 * kick, "push on": 2 * kick}
-    return found
-
-
-def _root_dof(model: Any, axis: int) -> int | None:
-    """Returns which velocity moves the first body along a world axis."""
-    for joint in range(model.njnt):
-        if model.jnt_bodyid[joint] != 1:
-            break
-        dof = int(model.jnt_dofadr[joint])
-        if model.jnt_type[joint] == _C.mjtJoint.mjJNT_FREE:
-            return dof + axis
-        is_slide = model.jnt_type[joint] == _C.mjtJoint.mjJNT_SLIDE
-        if (
-            is_slide
-            and not model.jnt_limited[joint]
-            and model.jnt_axis[joint][axis] == 1
-        ):
-            return dof
-    return None
+    return {
+        name: np.float32(value) * units[dofs[axis]]
+        for name, (axis, value) in directions.items()
+        if axis in dofs and model.nv
+    }
 
 
 def is_roaming(model: Any) -> bool:
     """Returns whether the robot may go where it likes."""
-    return any(_root_dof(model, axis) is not None for axis in (0, 1))
+    return bool(_root_dofs(model).keys() & {0, 1})
+
+
+def _root_dofs(model: Any) -> dict[int, int]:
+    """Returns which velocity moves the whole robot, by the axis along which it does."""
+    if model.nbody < 2:
+        return {}
+    data, jacobian = _C.MjData(model), np.zeros((3, model.nv))
+    _C.mj_forward(model, data)
+    _C.mj_jacSubtreeCom(model, data, jacobian, 1)
+    is_free = ~model.jnt_limited[model.dof_jntid].astype(bool)
+    return {
+        axis: dof
+        for axis, unit in enumerate(np.eye(3))
+        for dof in np.flatnonzero(is_free).tolist()
+        if np.allclose(jacobian[:, dof], unit)
+    }
 
 
 def size(model: Any) -> float:

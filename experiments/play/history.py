@@ -19,9 +19,9 @@ class Frame(NamedTuple):
       ghosts: `[G, H+1, Q]`, what was imagined in the step before, from where it began.
       members: `[G]`, whose imagination each of them is.
       earned: by the step; NaN where nothing says it.
-      promise: the return that was foreseen, per step.
+      promised: the return that was foreseen, per step.
       disagreement: of the members about what was foreseen.
-      wanted: in words.
+      wanted: in words, as `Command.label`.
       world: to go on from; None of what is only watched.
     """
 
@@ -31,7 +31,7 @@ class Frame(NamedTuple):
     ghosts: np.ndarray
     members: np.ndarray
     earned: float
-    promise: float
+    promised: float
     disagreement: float
     wanted: str
     world: World | None

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxpets.envs import Robot
 
-from .asking import Asked
+from .command import Command
 from .core import Core, World
 from .geometry import pushes
 from .history import Frame
@@ -29,11 +29,13 @@ class Stepper(Protocol):
         """Names of the pushes that there are, and the velocities `[V]` each adds."""
         ...
 
-    def start(self, asked: Asked) -> Frame:
+    def start(self, command: Command) -> Frame:
         """Returns the first frame of a new trial."""
         ...
 
-    def step(self, frame: Frame, asked: Asked, push: str | None) -> tuple[Frame, str]:
+    def step(
+        self, frame: Frame, command: Command, push: str | None
+    ) -> tuple[Frame, str]:
         """Returns the frame after a frame, and why there is none after it, if so."""
         ...
 
@@ -46,20 +48,19 @@ class Live:
         self.pushes = pushes(robot.model) if core.push_size else {}
         self._still = np.zeros(core.push_size, np.float32)
         self._params = params
-        self._horizon = core.horizon
         self._key, self._start_key = jax.random.split(jax.random.key(seed))
         self._starts = 0
-        self._start, self._think, self._act = (
-            jax.jit(x) for x in (core.start, core.think, core.act)
+        self._start, self._plan, self._step = (
+            jax.jit(x) for x in (core.start, core.plan, core.step)
         )
 
-    def start(self, asked: Asked) -> Frame:
+    def start(self, command: Command) -> Frame:
         """Returns the first frame of a new trial; the first call compiles."""
         key = jax.random.fold_in(self._start_key, self._starts)
         self._starts += 1
-        world = self._start(asked.wish, key)
+        world = self._start(command.reward, key)
         # Compiled now, while somebody is told so.
-        frame, _ = self._stepped(world, asked, None)
+        frame, _ = self._stepped(world, command, None)
         return frame._replace(
             number=0,
             qpos=np.asarray(world.qpos),
@@ -67,18 +68,22 @@ class Live:
             world=world,
         )
 
-    def step(self, frame: Frame, asked: Asked, push: str | None) -> tuple[Frame, str]:
+    def step(
+        self, frame: Frame, command: Command, push: str | None
+    ) -> tuple[Frame, str]:
         """Returns the frame after a frame, and why a new trial must begin, if so."""
         assert frame.world is not None
-        return self._stepped(frame.world, asked, push)
+        return self._stepped(frame.world, command, push)
 
     def _stepped(
-        self, world: World, asked: Asked, push: str | None
+        self, world: World, command: Command, push: str | None
     ) -> tuple[Frame, str]:
         added = self.pushes[push] if push else self._still
-        thought = self._think(self._params, asked.wish, self._key, world)
-        world, earned, ended = self._act(asked.wish, jnp.asarray(added), world, thought)
-        ghosts = np.asarray(thought.ghosts)
+        plan = self._plan(self._params, command.reward, self._key, world)
+        world, earned, ended = self._step(
+            command.reward, jnp.asarray(added), world, plan
+        )
+        ghosts = np.asarray(plan.ghosts)
         members, particles = ghosts.shape[:2]
         frame = Frame(
             number=int(world.number),
@@ -87,9 +92,9 @@ class Live:
             ghosts=ghosts.reshape(-1, *ghosts.shape[2:]),
             members=np.repeat(np.arange(members), particles),
             earned=float(earned),
-            promise=float(thought.promise),
-            disagreement=float(thought.disagreement),
-            wanted=asked.words,
+            promised=float(plan.promised),
+            disagreement=float(plan.disagreement),
+            wanted=command.label,
             world=world,
         )
         if not np.isfinite(frame.qpos).all():

@@ -4,17 +4,18 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any
 
-import numpy as np
 import viser
 
 from jaxpets.envs import Robot
 
 from ..errors import RunError, reason
-from . import geometry, recorder, report
-from .panel import AddButtons, Panel, Part
-from .pilot import Pilot
+from . import controls, geometry, readout, recorder
+from .command import Commands
+from .controls import Controls
+from .panel import Panel
+from .plan_part import PlanPart
+from .run_part import RunPart
 from .scene import Scene
 from .session import MEMORY, Session
 
@@ -30,33 +31,27 @@ class Page:
         robot: Robot,
         env: str,
         session: Session,
-        make_part: Callable[[Any, AddButtons], Part],
-        make_pilot: Callable[[Any], Pilot],
         title: str,
+        commands: Commands | None,
+        make_part: Callable[[Panel], PlanPart | RunPart],
     ) -> None:
-        """Builds it.
-
-        Args:
-          server: that serves it.
-          robot: that is seen.
-          env: its name, or its file.
-          session: to be shown and steered.
-          make_part: of the panel.
-          make_pilot: of what the controls say at first.
-          title: in a few words.
-        """
         self._robot, self._env, self._session = robot, env, session
         self._scene = Scene(server, robot.model)
+        title = f"{robot.name.rpartition('/')[2]}: {title}"
         pushes = tuple(session.stepper.pushes)
-        self._panel = Panel(server, title, make_part, pushes=pushes, save=self._save)
-        self._panel.follow(self._panel.read()._replace(line=session.asked.line))
-        self._pilot = make_pilot(self._panel.read())
+        self._panel = Panel(server, title, pushes=pushes, save=self._save)
+        self._part = make_part(self._panel)
+        self._panel.add_memory()
+        self._part.show_line(session.command.line)
+        self._controls = Controls(commands, self._part.read(0.0))
         self._is_saving = threading.Lock()
 
     def steer(self, session: Session) -> None:
         """Reads the controls, for the thread of the world."""
-        said = self._pilot.steer(session, self._panel.read(), self._panel.events())
-        self._panel.follow(said)
+        values = self._part.read(self._panel.back)
+        values = self._controls.apply(session, values, self._panel.presses())
+        self._part.show_line(values.line)
+        self._panel.show_back(values.back)
 
     def run(self, is_over: Callable[[float], bool], rate: float) -> None:
         """Shows what there is to be shown.
@@ -86,33 +81,34 @@ class Page:
         if share < 1 and after.number == before.number + 1:
             model = self._robot.model
             qpos = geometry.between(model, before.qpos, after.qpos, share)
-        self._scene.show(qpos, after, self._panel.part.look)
+        self._scene.show(qpos, after, self._part.look)
 
     def _speak(self, now: float) -> None:
         session, shown = self._session, self._session.shown
         if shown is None:
-            self._panel.say(report.small(session.notice), "")
+            self._panel.say(readout.small(session.notice), "")
             return
         frame, clock = shown.at(now)[1], session.clock
-        status = report.status(
+        status = readout.status(
             clock.rate, clock.pace, session.speed, session.is_paused, session.back,
             session.notice,
         )  # fmt: skip
-        self._panel.say(status, report.readings(self._robot, frame))
-        self._panel.part.speak(session, frame)
+        self._panel.say(status, readout.readings(self._robot, frame))
+        self._part.speak(session, frame)
 
     def _save(self, kind: str, seconds: float, client: viser.ClientHandle) -> None:
         """Makes a file of the last seconds for one visitor, one file at a time."""
         text = "It takes a moment."
         note = client.add_notification("Saving", text, loading=True)
         name = f"{self._robot.name.replace('/', '-')}.{kind}"
+        seconds = min(max(controls.number(seconds, 15.0), 1.0), MEMORY)
         try:
             with self._is_saving:
-                frames = self._session.recent(float(np.clip(seconds, 1.0, MEMORY)))
+                frames = self._session.history.recent(seconds)
                 if kind == "mp4":
                     data = recorder.mp4(self._env, frames)
                 else:
-                    look = self._panel.part.look
+                    look = self._part.look
                     data = recorder.html(self._robot, frames, look)
             client.send_file_download(name, data)
             note.body = f"{name}, {len(data) / 1e6:.1f} MB"

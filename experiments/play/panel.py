@@ -2,45 +2,16 @@
 
 import queue
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import viser
 
-from . import pilot, report
-from .history import Frame
-from .pilot import Event, Inputs
-from .scene import Look
-from .session import MEMORY, Session
+from . import controls, readout
+from .controls import Press
+from .session import MEMORY
 
-# `(group, label, options, hint)`: buttons in a row.
-AddButtons = Callable[[str, str, Sequence[str], str], None]
 # `(kind, seconds, client)`: what a visitor wants to keep, "mp4" or "html".
 Save = Callable[[str, float, viser.ClientHandle], None]
-
-
-class Part(Protocol):
-    """What is on the panel beside the clock: that of a kind of page."""
-
-    @property
-    def look(self) -> Look:
-        """What of the imagination is to be seen."""
-        ...
-
-    def add_below(self) -> None:
-        """Adds what stands below the clock; the rest is there before."""
-        ...
-
-    def read(self, back: float) -> Inputs:
-        """Returns what its controls say, beside how far back is looked."""
-        ...
-
-    def follow(self, said: Inputs) -> None:
-        """Has its controls say what they led to."""
-        ...
-
-    def speak(self, session: Session, frame: Frame) -> None:
-        """Says what goes on; called a few times a second."""
-        ...
 
 
 class Panel:
@@ -50,43 +21,73 @@ class Panel:
         self,
         server: viser.ViserServer,
         title: str,
-        make_part: Callable[[Any, AddButtons], Part],
         *,
         pushes: Sequence[str],
         save: Save,
     ) -> None:
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._save = save
-        self._gui: Any = server.gui
-        gui = self._gui
-        gui.configure_theme(
+        self._presses: queue.SimpleQueue[Press] = queue.SimpleQueue()
+        self._pushes, self._save = tuple(pushes), save
+        self.gui: Any = server.gui
+        self.gui.configure_theme(
             show_logo=False, show_share_button=False, brand_color=(0, 114, 178)
         )
-        gui.set_panel_label(title)
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(360)
-        self._status = gui.add_html(report.small("It is about to begin."))
-        self._readings = gui.add_html("")
-        self.part = make_part(gui, self._add_buttons)
-        self._add_time(pushes)
-        self.part.add_below()
-        self._add_memory()
+        self.gui.set_panel_label(title)
+        self.gui.main_panel.dock_right()
+        self.gui.main_panel.set_width(360)
+        self._status = self.gui.add_html(readout.small("It is about to begin."))
+        self._readings = self.gui.add_html("")
+
+    # For who puts it together.
+
+    def add_buttons(
+        self, group: str, label: str, options: Sequence[str], hint: str
+    ) -> None:
+        """Adds buttons in a row."""
+        handle = self.gui.add_button_group(label, tuple(options), hint=hint)
+
+        async def pressed(event: Any) -> None:
+            self._presses.put(Press(group, str(event.target.value)))
+
+        handle.on_click(pressed)
+
+    def add_time(self) -> None:
+        """Adds the clock, where a part wants it."""
+        with self.gui.add_folder("Time"):
+            names = (controls.PAUSE, controls.GO_ON, controls.STEP, controls.RESET)
+            self.add_buttons("time", "time", names, "For all who look.")
+            speeds = tuple(controls.SPEEDS)
+            self.add_buttons("speed", "speed", speeds, "Of real time.")
+            if self._pushes:
+                self.add_buttons("push", "push", self._pushes, "Adds to its speed.")
+
+    def add_memory(self) -> None:
+        """Adds what goes back, and what saves."""
+        with self.gui.add_folder("The last minute"):
+            hint = "Looks at a moment; the world waits."
+            args = ("go back", -MEMORY, 0.0, 0.05, 0.0)
+            self._back = self.gui.add_slider(*args, hint=hint)
+            hint = "What came after it is forgotten."
+            self.add_buttons("time", "and", (controls.FROM_HERE,), hint)
+            args = ("seconds", 5.0, MEMORY, 5.0, 15.0)
+            self._seconds = self.gui.add_slider(*args, hint="Of the end, to be saved.")
+            handle = self.gui.add_button_group("save", ("video (mp4)", "3D (html)"))
+            handle.on_click(self._saving)
 
     # For the thread of the world.
 
-    def read(self) -> Inputs:
-        """Returns what the controls say, which may be anything."""
+    @property
+    def back(self) -> float:
+        """How many s before now is looked at, which may be anything."""
         value = self._back.value
-        return self.part.read(-value if isinstance(value, float | int) else 0.0)
+        return -value if isinstance(value, float | int) else 0.0
 
-    def events(self) -> list[Event]:
+    def presses(self) -> list[Press]:
         """Returns what was pressed since the last call."""
-        return [self._events.get_nowait() for _ in range(self._events.qsize())]
+        return [self._presses.get_nowait() for _ in range(self._presses.qsize())]
 
-    def follow(self, said: Inputs) -> None:
-        """Has the controls say what they led to."""
-        self.part.follow(said)
-        if said.back == 0 and self._back.value != 0:
+    def show_back(self, back: float) -> None:
+        """Has the slider say that nothing but now is looked at."""
+        if back == 0 and self._back.value != 0:
             self._back.value = 0.0
 
     # For the thread that shows.
@@ -95,39 +96,6 @@ class Panel:
         """Writes the head of the panel, as HTML."""
         write(self._status, status)
         write(self._readings, readings)
-
-    # Its parts.
-
-    def _add_buttons(
-        self, group: str, label: str, options: Sequence[str], hint: str
-    ) -> None:
-        handle = self._gui.add_button_group(label, tuple(options), hint=hint)
-
-        async def pressed(event: Any) -> None:
-            self._events.put(Event(group, str(event.target.value)))
-
-        handle.on_click(pressed)
-
-    def _add_time(self, pushes: Sequence[str]) -> None:
-        with self._gui.add_folder("Time"):
-            options = (pilot.PAUSE, pilot.GO_ON, pilot.STEP, pilot.RESET)
-            self._add_buttons("time", "time", options, "For all who look.")
-            self._add_buttons("speed", "speed", tuple(pilot.SPEEDS), "Of real time.")
-            if pushes:
-                self._add_buttons("push", "push", tuple(pushes), "Adds to its speed.")
-
-    def _add_memory(self) -> None:
-        gui = self._gui
-        with gui.add_folder("The last minute"):
-            hint = "Looks at a moment; the world waits."
-            self._back = gui.add_slider("go back", -MEMORY, 0.0, 0.05, 0.0, hint=hint)
-            hint = "What came after it is forgotten."
-            self._add_buttons("time", "and", (pilot.FROM_HERE,), hint)
-            self._seconds = gui.add_slider(
-                "seconds", 5.0, MEMORY, 5.0, 15.0, hint="Of the end, to be saved."
-            )
-            handle = gui.add_button_group("save", ("video (mp4)", "3D (html)"))
-            handle.on_click(self._saving)
 
     def _saving(self, event: Any) -> None:
         """Runs in a thread of viser's, as it takes a while."""

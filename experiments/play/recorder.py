@@ -20,13 +20,7 @@ _BETWEEN = 2  # pictures per step, so that it moves smoothly
 
 
 def html(robot: Robot, frames: Sequence[Frame], look: Look) -> bytes:
-    """Returns one HTML file that replays frames in 3D, without a server.
-
-    Args:
-      robot: that is seen.
-      frames: oldest first.
-      look: what of the imagination is to be seen.
-    """
+    """Returns one HTML file that replays frames in 3D, without a server."""
     with serving() as server:
         scene = Scene(server, robot.model)
         scene.show(frames[0].qpos, frames[0], look)
@@ -42,10 +36,6 @@ def html(robot: Robot, frames: Sequence[Frame], look: Look) -> bytes:
 
 def mp4(env: str, frames: Sequence[Frame]) -> bytes:
     """Returns a video of frames, as `tools.video` renders a recorded trial.
-
-    Args:
-      env: the robot, by its name or its file.
-      frames: oldest first.
 
     Raises:
       RunError: if no OpenGL works here; one line says why.

@@ -1,5 +1,6 @@
 """What the page of a run says: its last trial, and its curves as they grow."""
 
+import html
 import time
 from typing import Any
 
@@ -9,10 +10,10 @@ from viser import uplot
 from ..errors import RunError
 from ..storage import status
 from ..storage.metrics import number
+from .controls import Values
 from .history import Frame
-from .panel import AddButtons, write
-from .pilot import Inputs
-from .report import escaped, small
+from .panel import Panel, write
+from .readout import small
 from .scene import Look
 from .session import Session
 from .watch import Replay, Watched
@@ -26,27 +27,22 @@ class RunPart:
 
     look = Look(paths=False, ghosts=False)
 
-    def __init__(
-        self, gui: Any, add_buttons: AddButtons, run: Watched, replay: Replay
-    ) -> None:
-        del add_buttons
+    def __init__(self, panel: Panel, run: Watched, replay: Replay) -> None:
         self._run, self._replay, self._next = run, replay, 0.0
-        tasks = run.robot.tasks.names
+        gui, tasks = panel.gui, run.robot.tasks.names
         self._text = gui.add_html(small("It looks for a trial."))
+        panel.add_time()
         with gui.add_folder("How it explores"):
             self._value = _chart(gui, "disagreement that it sought", ["per step"])
             self._error = _chart(gui, "error of the model", ["squared"])
             self._returns = _chart(gui, "what the tasks would have earned", tasks)
 
-    def add_below(self) -> None:
-        """Adds nothing."""
-
-    def read(self, back: float) -> Inputs:
+    def read(self, back: float) -> Values:
         """Returns how far back is looked."""
-        return Inputs("", (), 0.0, back)
+        return Values("", (), 0.0, back)
 
-    def follow(self, said: Inputs) -> None:
-        """Has nothing to follow."""
+    def show_line(self, line: str) -> None:
+        """Has no line."""
 
     def speak(self, session: Session, frame: Frame) -> None:
         """Says how far the run is; looks at its folder now and then."""
@@ -55,7 +51,7 @@ class RunPart:
         if now < self._next:
             return
         self._next = now + _SECONDS
-        write(self._text, small(escaped(self._line())))
+        write(self._text, small(html.escape(self._line())))
         rows = self._run.rows()
         if not rows:
             return

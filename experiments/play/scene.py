@@ -124,10 +124,10 @@ class Scene:
         """Places the camera at first: from the side, a little above."""
         camera, size = self._server.initial_camera, self._size
         height = float(pose.center[2])
-        place = (0.5 * size, 0.0) if self._is_roaming else pose.center[:2]
+        place = (0.25 * size, 0.0) if self._is_roaming else pose.center[:2]
         middle = np.append(place, height)  # what it imagines is ahead of it
         camera.look_at = middle
-        camera.position = middle + size * np.array([0.5, -3.8, 1.2])
+        camera.position = middle + size * np.array([0.4, -4.0, 1.2])
         camera.fov = 0.75
 
 

@@ -7,11 +7,11 @@ it: it looks at the controls once a step.
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
-from .asking import Asked
 from .clock import Clock
+from .command import Command
 from .history import Frame, History
 from .live import Stepper
 
@@ -43,15 +43,9 @@ class Shown(NamedTuple):
 class Session:
     """Owns the world. Methods are for its own thread, but where they say otherwise."""
 
-    def __init__(self, stepper: Stepper, asked: Asked) -> None:
-        """Prepares a session, which `run` runs.
-
-        Args:
-          stepper: gives frames.
-          asked: at first.
-        """
+    def __init__(self, stepper: Stepper, command: Command) -> None:
         self.stepper = stepper
-        self.asked = asked
+        self.command = command
         self.speed = 1.0
         self.is_paused = False
         self.history = History(MEMORY, stepper.step_time)
@@ -61,7 +55,7 @@ class Session:
         self._stopped = threading.Event()
         self._push: str | None = None
         self._steps = 0  # to do while paused
-        self._back = 0.0
+        self.back = 0.0
 
     # For any thread.
 
@@ -93,8 +87,8 @@ class Session:
 
     def restart(self) -> None:
         """Begins a new trial."""
-        self._back = 0.0
-        frame = self.stepper.start(self.asked)
+        self.back = 0.0
+        frame = self.stepper.start(self.command)
         self.history.append(frame)
         self._show_only(frame)
 
@@ -118,26 +112,17 @@ class Session:
     def look_back(self, seconds: float) -> None:
         """Shows a moment of the last minute; other than the last, the world waits."""
         seconds = min(max(seconds, 0.0), self.history.seconds)
-        if seconds == self._back:
+        if seconds == self.back:
             return
-        self._back = seconds
+        self.back = seconds
         self.is_paused = self.is_paused or seconds > 0
         self._show_only(self.history.at(seconds))
 
     def go_on_from_here(self) -> None:
         """Goes on from what is shown; what came after it is forgotten."""
-        self.history.drop_after(self.history.at(self._back))
-        self._back = 0.0
+        self.history.drop_after(self.history.at(self.back))
+        self.back = 0.0
         self.is_paused = False
-
-    @property
-    def back(self) -> float:
-        """How many s before the last moment it is that is shown."""
-        return self._back
-
-    def recent(self, seconds: float = MEMORY) -> Sequence[Frame]:
-        """Returns the frames of the last seconds, for any thread."""
-        return self.history.recent(seconds)
 
     # Its loop.
 
@@ -157,7 +142,7 @@ class Session:
     def _step(self) -> None:
         last, push, self._push = self.history.at(0.0), self._push, None
         self.clock.begin(self.speed)
-        frame, over = self.stepper.step(last, self.asked, push)
+        frame, over = self.stepper.step(last, self.command, push)
         if over:
             self.notice = f"{over}: a new one has begun"
             self.restart()

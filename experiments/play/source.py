@@ -20,17 +20,9 @@ _PRETRAINED = "pretrained"
 
 
 class Source(NamedTuple):
-    """A robot and what is known of it.
+    """A robot and what is known of it."""
 
-    Attributes:
-      robot: with geometry.
-      size: of the model.
-      params: of the model.
-      search: how plans are searched.
-      title: in a few words.
-    """
-
-    robot: Robot
+    robot: Robot  # with geometry
     size: jaxpets.EnsembleConfig
     params: jaxpets.EnsembleParams
     search: PlannerConfig
@@ -71,14 +63,6 @@ def robot_named(env: str) -> Robot:
     if robot.model is None or robot.qpos_fn is None:
         raise UsageError(f"--env {env} has no model that can be drawn.")
     return robot
-
-
-def planner_parts(
-    source: Source,
-) -> tuple[jaxpets.typing.RolloutFn, jaxpets.optimizers.TrajectoryOptimizer, str]:
-    """Returns what imagines, what searches, and how it imagines."""
-    rollout, kind = build.rollout_of(source.robot, source.size, source.search)
-    return rollout, build.optimizer(source.search, source.robot.env), kind
 
 
 def _of_file(path: Path, said: str, env: str | None) -> Source:

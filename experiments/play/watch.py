@@ -13,7 +13,7 @@ from .. import exploration, user_files
 from ..errors import CheckpointError, RunError
 from ..storage import metrics, rundir
 from ..storage.folder import RunFolder
-from .asking import Asked
+from .command import Command
 from .history import Frame
 from .source import robot_named
 
@@ -82,9 +82,9 @@ class Replay:
         self._track = jax.jit(run.robot.qpos_fn)
         self._frames = [self._rest()]
 
-    def start(self, asked: Asked) -> Frame:
+    def start(self, command: Command) -> Frame:
         """Returns the first frame of the last trial, or the robot at rest."""
-        del asked
+        del command
         try:
             if self._run.trial() > self.trial and (found := self._run.last_obs()):
                 self.trial, obs = found
@@ -93,9 +93,11 @@ class Replay:
             pass
         return self._frames[0]
 
-    def step(self, frame: Frame, asked: Asked, push: str | None) -> tuple[Frame, str]:
+    def step(
+        self, frame: Frame, command: Command, push: str | None
+    ) -> tuple[Frame, str]:
         """Returns the frame after a frame, and why there is none after it, if so."""
-        del asked, push
+        del command, push
         if frame.number + 1 < len(self._frames):
             return self._frames[frame.number + 1], ""
         return frame, f"trial {self.trial}" if self.trial else "no trial is over yet"

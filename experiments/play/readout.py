@@ -8,9 +8,8 @@ import numpy as np
 
 from jaxpets.envs import Robot
 
-from .asking import EXPLORE, Asked
+from .command import TO_EXPLORE, Command
 from .history import Frame
-from .wishes import Language
 
 _ON_TIME = 0.97  # of real time; less is said
 
@@ -35,9 +34,9 @@ class Curves(NamedTuple):
 def curves(frames: Sequence[Frame], horizon: int, step_time: float) -> Curves:
     """Returns the curves over frames, oldest first."""
     seconds = step_time * np.arange(1 - len(frames), 1)
-    promise = np.array([frame.promise for frame in frames], float)
+    foreseen = np.array([frame.promised for frame in frames], float)
     rewards = np.array([frame.earned for frame in frames], float)
-    doubt = np.array([frame.disagreement for frame in frames], float)
+    disagreement = np.array([frame.disagreement for frame in frames], float)
     promised, earned = np.full((2, len(frames)), np.nan)
     ends = [i for i in range(1, len(frames)) if not _follows(frames[i - 1], frames[i])]
     begins = np.zeros(len(frames), int)  # of the stretch without a change
@@ -45,9 +44,9 @@ def curves(frames: Sequence[Frame], horizon: int, step_time: float) -> Curves:
         begins[end:] = end
     for i in range(horizon, len(frames)):
         if begins[i] <= i - horizon:
-            promised[i] = promise[i - horizon + 1]
+            promised[i] = foreseen[i - horizon + 1]
             earned[i] = rewards[i - horizon + 1 : i + 1].mean()
-    return Curves(seconds, promised, earned, doubt)
+    return Curves(seconds, promised, earned, disagreement)
 
 
 def _follows(before: Frame, after: Frame) -> bool:
@@ -84,26 +83,26 @@ def readings(robot: Robot, frame: Frame) -> str:
     return small(" &nbsp; ".join(parts))
 
 
-def under_line(asked: Asked, language: Language) -> str:
+def under_line(command: Command) -> str:
     """Returns what stands under the line of text, as HTML: all of it is escaped."""
-    if asked.problem:
-        where = asked.line[: asked.column] + "▸" + asked.line[asked.column :]
+    if command.problem:
+        where = command.line[: command.column] + "▸" + command.line[command.column :]
         text = (
-            f"{html.escape(asked.problem)}<br><code>{html.escape(where[:200])}</code>"
+            f"{html.escape(command.problem)}<br><code>{html.escape(where[:200])}</code>"
         )
         return small(text, "#c92a2a")
-    if asked.name == EXPLORE:
+    if command.name == TO_EXPLORE:
         text = "It seeks what its networks disagree about."
-    elif asked.name and not language.tasks.get(asked.name):
-        text = f"It performs {html.escape(asked.name)}, a reward of the robot's own."
-    elif asked.name:
-        text = f"It performs {html.escape(asked.name)}."
+    elif command.name and not command.line:
+        text = f"It performs {html.escape(command.name)}, a reward of the robot's own."
+    elif command.name:
+        text = f"It performs {html.escape(command.name)}."
     else:
         text = "It does what the line says."
     return small(text)
 
 
-def doubt(frame: Frame) -> str:
+def disagreement(frame: Frame) -> str:
     """Returns how much the members disagree, as HTML."""
     text = f"disagreement <b>{frame.disagreement:.2f}</b> of the model's own noise"
     return small(text)
@@ -113,8 +112,3 @@ def small(text: str, color: str = "inherit") -> str:
     """Returns a paragraph of HTML, of text that is HTML already."""
     style = f"font-size:0.85em;line-height:1.4;padding:0 0.75em 0.5em;color:{color}"
     return f'<div style="{style};overflow-wrap:anywhere">{text}</div>'
-
-
-def escaped(text: str) -> str:
-    """Returns HTML that shows a text as it is."""
-    return html.escape(text)

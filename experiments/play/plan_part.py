@@ -1,47 +1,42 @@
 """The controls of a robot that plans: what is asked of it, and what it imagines."""
 
 import html
-from typing import Any
 
 import numpy as np
 from viser import uplot
 
 from jaxpets import formulas
 
-from . import report
-from .asking import EXPLORE
+from . import readout
+from .command import TO_EXPLORE, Commands
+from .controls import Values
 from .history import Frame
-from .panel import AddButtons, write
-from .pilot import Inputs
-from .report import small
+from .panel import Panel, write
+from .readout import small
 from .scene import Look
-from .session import Session
-from .wishes import Language
+from .session import MEMORY, Session
 
 PROMISED, EARNED = "#0072b2", "#d55e00"
 _CURVE_SECONDS = 15.0
 
 
-class WishPart:
+class PlanPart:
     """Buttons, a line and sliders for what is wanted; curves of what came of it."""
 
-    def __init__(
-        self, gui: Any, add_buttons: AddButtons, language: Language, horizon: int
-    ) -> None:
-        self._gui, self._language, self._horizon = gui, language, horizon
-        tasks = list(language.tasks)
-        add_buttons("wish", "task", tasks, "The model was never trained for it.")
+    def __init__(self, panel: Panel, commands: Commands, horizon: int) -> None:
+        self._gui, self._commands, self._horizon = panel.gui, commands, horizon
+        hint = "The model was never trained for it."
+        panel.add_buttons("reward", "task", list(commands.tasks), hint)
         hint = "Seeks what its networks disagree about."
-        add_buttons("wish", "or", [EXPLORE], hint)
-        self._line = gui.add_text("reward", "", hint="Type what you want more of.")
-        self._under_line = gui.add_html("")
-        with gui.add_folder("Words for it", expand_by_default=False):
-            gui.add_html(_vocabulary(language))
-        with gui.add_folder("Or the motion that you want"):
+        panel.add_buttons("reward", "or", [TO_EXPLORE], hint)
+        hint = "Type what you want more of."
+        self._line = self._gui.add_text("reward", "", hint=hint)
+        self._under_line = self._gui.add_html("")
+        with self._gui.add_folder("Words for it", expand_by_default=False):
+            self._gui.add_html(_vocabulary(commands))
+        with self._gui.add_folder("Or the motion that you want"):
             self._add_motion()
-
-    def add_below(self) -> None:
-        """Adds what it imagines."""
+        panel.add_time()
         with self._gui.add_folder("What it imagines"):
             self._add_imagination()
 
@@ -50,24 +45,24 @@ class WishPart:
         """What of the imagination is to be seen."""
         return Look(bool(self._paths.value), bool(self._ghosts.value))
 
-    def read(self, back: float) -> Inputs:
+    def read(self, back: float) -> Values:
         """Returns what the controls say, which may be anything."""
         sliders = tuple(slider.value for slider in self._sliders)
-        return Inputs(self._line.value, sliders, self._effort.value, back)
+        return Values(self._line.value, sliders, self._effort.value, back)
 
-    def follow(self, said: Inputs) -> None:
+    def show_line(self, line: str) -> None:
         """Has the line say what is asked for."""
-        if self._line.value != said.line:
-            self._line.value = said.line
+        if self._line.value != line:
+            self._line.value = line
 
     def speak(self, session: Session, frame: Frame) -> None:
         """Says what is asked for, what was promised, and what came."""
-        write(self._under_line, report.under_line(session.asked, self._language))
-        write(self._doubt, report.doubt(frame))
+        write(self._under_line, readout.under_line(session.command))
+        write(self._disagreement, readout.disagreement(frame))
         if session.back > 0:
             return
         step_time = session.stepper.step_time
-        found = report.curves(session.recent(), self._horizon, step_time)
+        found = readout.curves(session.history.recent(MEMORY), self._horizon, step_time)
         most = max(np.nanmax(found.disagreement, initial=0.0), 1e-9)
         share = np.nan_to_num(frame.disagreement) / most
         self._bar.value = float(np.clip(100 * share, 0, 100))
@@ -81,7 +76,7 @@ class WishPart:
                 slider.word.replace("_", " "), slider.low, slider.high, slider.step,
                 min(max(0.0, slider.low), slider.high), hint=f"In {slider.unit}.",
             )
-            for slider in self._language.sliders
+            for slider in self._commands.sliders
         ]  # fmt: skip
         hint = "What a unit of it costs: the sum of the squares of the action."
         self._effort = self._gui.add_slider(
@@ -93,7 +88,7 @@ class WishPart:
         self._paths = gui.add_checkbox("paths", True, hint="A color for each network.")
         hint = "Where it sees itself half way, and at the end."
         self._ghosts = gui.add_checkbox("ghosts", True, hint=hint)
-        self._doubt = gui.add_html("")
+        self._disagreement = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0)
         self._chart = gui.add_uplot(
             (np.zeros(1), np.zeros(1), np.zeros(1)),
@@ -108,10 +103,10 @@ class WishPart:
         )
 
 
-def _vocabulary(language: Language) -> str:
+def _vocabulary(commands: Commands) -> str:
     """Returns what may stand in a reward, as HTML."""
-    last = f"action_{language.action_size - 1}"
-    words = [*language.words, "effort", "action_0", "...", last, "pi"]
+    last = f"action_{commands.action_size - 1}"
+    words = [*commands.words, "effort", "action_0", "...", last, "pi"]
     signs = "+ - * / ** < <= > >= == != and or not"
     rows = ("  ".join(words), "  ".join(formulas.FUNCTIONS), signs)
     return small("<br>".join(map(html.escape, rows)))
