@@ -49,17 +49,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _serve(args: argparse.Namespace) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    with robots.without_gl():
-        try:
+    try:
+        with robots.without_gl():
             from . import serve
-        except ImportError as error:
-            raise UsageError(
-                f"the page needs the extra jaxpets[play] ({error}); install it with: "
-                "pip install 'jaxpets[play]'"
-            ) from error
-
-        options = serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"})
-        serve.serve(options, threading.Event(), _tell)
+    except ImportError as error:
+        raise UsageError(
+            f"the page needs the extra jaxpets[play] ({error}); install it with: "
+            "pip install 'jaxpets[play]'"
+        ) from error
+    options = serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"})
+    serve.serve(options, threading.Event(), _tell)
 
 
 def _tell(address: str) -> None:

@@ -98,5 +98,5 @@ class Live:
             world=world,
         )
         if not np.isfinite(frame.qpos).all():
-            return frame, "physics diverged"
-        return frame, "the trial ended" if bool(ended) else ""
+            return frame, "Physics diverged: a new trial has begun."
+        return frame, "The trial ended: a new one has begun." if bool(ended) else ""

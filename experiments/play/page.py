@@ -1,9 +1,10 @@
 """The page: what a session publishes, shown to all who look, at an even rate."""
 
+import contextlib
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import viser
 
@@ -45,13 +46,15 @@ class Page:
         self._part.show_line(session.command.line)
         self._controls = Controls(commands, self._part.read(0.0))
         self._is_saving = threading.Lock()
+        self._complaints: set[str] = set()
 
     def steer(self, session: Session) -> None:
         """Reads the controls, for the thread of the world."""
-        values = self._part.read(self._panel.back)
-        values = self._controls.apply(session, values, self._panel.presses())
-        self._part.show_line(values.line)
-        self._panel.show_back(values.back)
+        with self._unharmed():
+            values = self._part.read(self._panel.back)
+            values = self._controls.apply(session, values, self._panel.presses())
+            self._part.show_line(values.line)
+            self._panel.show_back(values.back)
 
     def run(self, is_over: Callable[[float], bool], rate: float) -> None:
         """Shows what there is to be shown.
@@ -63,14 +66,21 @@ class Page:
         words_at = 0.0
         while not is_over(1 / rate):
             now = time.monotonic()
-            try:
+            with self._unharmed():
                 self._show(now)
                 if now >= words_at:
                     words_at = now + 1 / _WORDS_RATE
                     self._speak(now)
-            except Exception:  # of what a visitor has made of a control
+
+    @contextlib.contextmanager
+    def _unharmed(self) -> Iterator[None]:
+        """Goes on whatever a visitor has made of viser's controls; says it once."""
+        try:
+            yield
+        except Exception as error:
+            if str(error) not in self._complaints:
+                self._complaints.add(str(error))
                 traceback.print_exc()
-                is_over(1.0)
 
     def _show(self, now: float) -> None:
         shown = self._session.shown
@@ -110,7 +120,7 @@ class Page:
                 else:
                     look = self._part.look
                     data = recorder.html(self._robot, frames, look)
-            client.send_file_download(name, data)
+            client.send_file_download(name, data, save_immediately=True)
             note.body = f"{name}, {len(data) / 1e6:.1f} MB"
         except (RunError, OSError, ValueError) as error:
             note.body = reason(error)

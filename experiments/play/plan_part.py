@@ -63,6 +63,7 @@ class PlanPart:
             return
         step_time = session.stepper.step_time
         found = readout.curves(session.history.recent(MEMORY), self._horizon, step_time)
+        write(self._returns, readout.returns(found))
         most = max(np.nanmax(found.disagreement, initial=0.0), 1e-9)
         share = np.nan_to_num(frame.disagreement) / most
         self._bar.value = float(np.clip(100 * share, 0, 100))
@@ -90,6 +91,7 @@ class PlanPart:
         self._ghosts = gui.add_checkbox("ghosts", True, hint=hint)
         self._disagreement = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0)
+        self._returns = gui.add_html("")
         self._chart = gui.add_uplot(
             (np.zeros(1), np.zeros(1), np.zeros(1)),
             (
@@ -97,7 +99,7 @@ class PlanPart:
                 uplot.Series(label="promised", stroke=PROMISED, width=2),
                 uplot.Series(label="earned", stroke=EARNED, width=2),
             ),
-            title="return per step: promised, and as it came",
+            title="return per step, over the horizon",
             scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
             height=160,
         )

@@ -108,6 +108,15 @@ def disagreement(frame: Frame) -> str:
     return small(text)
 
 
+def returns(found: Curves) -> str:
+    """Returns what was promised for the last steps, and what came, as HTML."""
+    promised, earned = (
+        "..." if np.isnan(x[-1]) else f"{x[-1]:.2f}"
+        for x in (found.promised, found.earned)
+    )
+    return small(f"promised <b>{promised}</b>, earned <b>{earned}</b>")
+
+
 def small(text: str, color: str = "inherit") -> str:
     """Returns a paragraph of HTML, of text that is HTML already."""
     style = f"font-size:0.85em;line-height:1.4;padding:0 0.75em 0.5em;color:{color}"

@@ -49,7 +49,7 @@ class Scene:
         self._world = scene.add_frame("/world", show_axes=False)
         rest = self._poses(np.asarray(model.qpos0))
         self._robot = [
-            _copies(scene, f"/world/robot/{i}", shape, rest)
+            _copies(scene, f"/robot/{i}", shape, rest)
             for i, shape in enumerate(self._shapes)
         ]
         self._ghosts: list[Any] = []
@@ -62,9 +62,9 @@ class Scene:
         middle = np.append(pose.center[:2], 0.0) if self._is_roaming else np.zeros(3)
         with self._server.atomic():
             for handle, shape in zip(self._robot, self._shapes, strict=True):
-                handle.batched_positions, handle.batched_wxyzs = geometry.placed(
-                    shape, pose
-                )
+                positions, handle.batched_wxyzs = geometry.placed(shape, pose)
+                # Here and not by the world's frame: a slow browser is late with either.
+                handle.batched_positions = (positions - middle).astype(np.float32)
             self._world.position = -middle
             self._ground.pass_by(middle)
             if (

@@ -10,10 +10,11 @@ import hmac
 import io
 import threading
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import viser
+from viser import _messages
 
 _HEAD_BYTES = 16_384
 _HEAD_SECONDS = 10.0
@@ -22,7 +23,22 @@ _HERE = ("localhost", "127.0.0.1", "::1")
 
 
 class Server(viser.ViserServer):
-    """A server that no visitor can have published elsewhere."""
+    """A server of which visitors can change the values of controls, and nothing else.
+
+    viser lets a message set any attribute of a control, for all who look.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        gui, kind = self.gui, _messages.GuiUpdateMessage
+        update = gui._handle_gui_updates
+
+        async def update_value(client_id: Any, message: Any) -> None:
+            if list(message.updates) == ["value"]:
+                await update(client_id, message)
+
+        gui._websock_interface.unregister_handler(kind, update)
+        gui._websock_interface.register_handler(kind, update_value)
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Returns None: viser would open a tunnel to its own site for anybody."""
@@ -135,6 +151,8 @@ class Proxy:
                 await self._pass_on(answer, reader, writer)
         except (OSError, EOFError, asyncio.LimitOverrunError, TimeoutError):
             pass  # whoever it was is gone, or does not speak HTTP
+        except asyncio.CancelledError:
+            pass  # it is being closed; asyncio would report a task that was cancelled
         finally:
             self._count -= 1
             writer.close()

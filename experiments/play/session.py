@@ -144,7 +144,7 @@ class Session:
         self.clock.begin(self.speed)
         frame, over = self.stepper.step(last, self.command, push)
         if over:
-            self.notice = f"{over}: a new one has begun"
+            self.notice = over
             self.restart()
             return
         self.history.append(frame)

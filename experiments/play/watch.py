@@ -100,7 +100,7 @@ class Replay:
         del command, push
         if frame.number + 1 < len(self._frames):
             return self._frames[frame.number + 1], ""
-        return frame, f"trial {self.trial}" if self.trial else "no trial is over yet"
+        return frame, "It is shown again." if self.trial else "No trial is over yet."
 
     def _of(self, obs: np.ndarray) -> list[Frame]:
         positions = np.asarray(self._track(obs))

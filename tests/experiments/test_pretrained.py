@@ -4,15 +4,20 @@ import json
 import shutil
 from pathlib import Path
 
+import chex
+import jax
 import numpy as np
 import pytest
 import runs
 
-from experiments import cli
+from experiments import cli, exploration
+from experiments.build import build
 from experiments.config import Config
+from experiments.errors import UsageError
 from experiments.presets import PRESETS
 from experiments.run import main
 from experiments.storage import checkpoint
+from experiments.storage.folder import RunFolder
 from experiments.tools import pretrained
 
 SMALL = (
@@ -160,3 +165,42 @@ def test_what_is_shipped_can_be_read(tmp_path):
         assert main([*command, "--out", str(tmp_path)]) == 0
         size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
         assert size < 4e6
+
+
+def test_a_page_plans_with_the_model_of_a_run(explored):
+    pytest.importorskip("viser", reason="the extra jaxpets[play] is not installed")
+    from experiments.play import source
+
+    found = source.found(str(explored))
+    assert found.title == f"{explored.name}, trial 3"
+    assert found.robot.name == "pets/half_cheetah"
+    folder = RunFolder(explored)
+    config = exploration.config_of(folder)
+    _, state = folder.restore(exploration.template(config, build(config)))
+    saved = jax.tree.map(lambda x: x[0], state.params)
+    chex.assert_trees_all_equal(found.params, saved)
+    with pytest.raises(UsageError, match="--seed 9"):
+        source.found(str(explored), seed=9)
+
+
+def test_a_run_is_watched_while_it_explores(explored, tmp_path):
+    pytest.importorskip("viser", reason="the extra jaxpets[play] is not installed")
+    from experiments.play.command import NOTHING
+    from experiments.play.watch import Replay, Watched
+
+    begun = tmp_path / explored.name  # before a trial is saved, and then after it
+    shutil.copytree(explored, begun, ignore=lambda *_: ["checkpoints"])
+    run = Watched(begun, env=None, seed=None)
+    replay = Replay(run)
+    first = replay.start(NOTHING)
+    assert replay.trial == 0 and replay.step(first, NOTHING, None)[1]
+    shutil.copytree(explored / "checkpoints", begun / "checkpoints")
+    before = {x: x.stat().st_mtime_ns for x in begun.rglob("*")}
+    frames = [replay.start(NOTHING)]
+    while not (found := replay.step(frames[-1], NOTHING, None))[1]:
+        frames.append(found[0])
+    assert replay.trial == runs.LAST and len(frames) == runs.STEPS
+    assert found[1] == "It is shown again."
+    assert frames[-1].obs[0] != frames[0].obs[0]
+    assert [row["trial"] for row in run.rows()] == [1, 2, 3]
+    assert before == {x: x.stat().st_mtime_ns for x in begun.rglob("*")}
