@@ -300,6 +300,16 @@ def test_only_the_command_opens_the_tools():
     assert {name for name in users if room(name) != "tools"} <= doors
 
 
+def test_nothing_below_knows_the_page():
+    users = {name for name, found in EXPERIMENTS.items() if "play" in map(room, found)}
+    viewers = {
+        name
+        for name, dotted in IMPORTED.items()
+        if {x.split(".")[0] for x in dotted} & {"viser", "trimesh"}
+    }
+    assert {room(name) for name in users | viewers} == {"play"}
+
+
 def test_no_circle_of_experiments():
     graphlib.TopologicalSorter(EXPERIMENTS).prepare()
 

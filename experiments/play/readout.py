@@ -64,7 +64,7 @@ def status(
     elif rate and pace < _ON_TIME * speed:
         text = (
             f"This machine plans {rate:.1f} steps a second, so time runs at "
-            f"{pace:.2f} of its speed."
+            f"{pace:.2f} of its speed"
         )
     else:
         kind = "real time" if speed == 1 else f"{speed:g} of real time"

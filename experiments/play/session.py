@@ -16,6 +16,7 @@ from .history import Frame, History
 from .live import Stepper
 
 MEMORY = 60.0  # s
+_NEWS = 3.0  # s of a trial
 _IDLE = 1 / 30  # s between looks at the controls while the world stands still
 
 
@@ -148,6 +149,8 @@ class Session:
             self.restart()
             return
         self.history.append(frame)
+        if frame.number * self.stepper.step_time > _NEWS:
+            self.notice = ""
         if self.is_paused:
             self._show_only(frame)
             return

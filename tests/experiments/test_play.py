@@ -347,6 +347,7 @@ def test_what_breaks_is_said_and_the_world_waits(capsys):
     session.pause(False)
     while session.history.at(0.0).number < 4 and time.monotonic() < deadline:
         time.sleep(0.01)
+    assert session.notice  # until somebody has had the time to read it
     session.stop()
     thread.join(5)
     assert session.history.at(0.0).number >= 4 and not thread.is_alive()

@@ -145,6 +145,7 @@ def test_a_typed_reward_takes_effect(visitor):
 
 
 def test_a_wrong_reward_is_explained_while_typing(visitor):
+    visitor.press("pause")  # its plans take most of the time of these tests
     visitor.line.press("End")
     visitor.line.press_sequentially(" + heigt")
     visitor.sees("There is no 'heigt', but height")
@@ -157,6 +158,8 @@ def test_two_visitors_see_one_robot(visitor, browser, address):
     other = Visitor(browser, address)
     other.sees("It does what the line says.")
     assert other.line.input_value() == visitor.line.input_value()
+    other.press("go on")
+    visitor.sees("steps a second")
     other.press("pause")
     visitor.sees("paused")
     assert other.number("velocity") == visitor.number("velocity")
@@ -176,10 +179,10 @@ def test_a_moment_that_is_gone_back_to(visitor):
     wait(lambda: visitor.number("velocity") != now)
     visitor.press("go on from here")
     visitor.sees("steps a second")
+    visitor.press("pause")
 
 
 def test_what_was_seen_replays_without_a_server(visitor, browser, tmp_path):
-    visitor.press("pause")
     with visitor.page.expect_download() as download:
         visitor.press("3D (html)")
     path = tmp_path / "seen.html"
@@ -220,7 +223,6 @@ def talk(address, messages):
 
 
 def test_garbage_and_a_storm_do_not_stop_it(visitor, address):
-    visitor.press("go on")
     slider = visitor.page.get_by_role("slider").nth(0)
     slider.press("ArrowRight")
     wait(lambda: visitor.line.input_value().startswith("-abs(velocity"))
@@ -244,6 +246,7 @@ def test_garbage_and_a_storm_do_not_stop_it(visitor, address):
     talk(address, [*storm, with_value(2.0)])
     visitor.press("forward")
     visitor.sees("It performs forward.")
+    visitor.press("go on")
     before = visitor.number("velocity")
     wait(lambda: visitor.number("velocity") != before)
 
