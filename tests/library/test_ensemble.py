@@ -68,6 +68,16 @@ def test_predict_equals_the_reference(model, params):
         np.testing.assert_allclose(variance[e], np.exp(logvar), rtol=1e-4)
 
 
+def test_a_member_may_have_actions_of_its_own(model, params):
+    obs, action = batch()
+    own = jnp.stack([action, -action, 2.0 * action])
+    mean, variance = model.predict(params, obs, own)
+    for i in range(3):
+        want = model.predict(params, obs, own[i])
+        np.testing.assert_allclose(mean[i], want[0][i], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(variance[i], want[1][i], rtol=1e-6)
+
+
 def test_loss_equals_the_reference(model, params):
     rng = np.random.default_rng(3)
     inputs = rng.normal(size=(E, B, D + A)).astype(np.float32)
@@ -283,7 +293,7 @@ def test_wrong_arguments_fail_when_traced(model, params):
     obs, action = batch()
     with pytest.raises(ValueError, match=r"obs must be float32\[3, B, 2\], got"):
         model.predict(params, obs[:2], action)
-    with pytest.raises(ValueError, match=r"action must be float32\[7, 1\], got"):
+    with pytest.raises(ValueError, match=r"action must be float32\[..., 7, 1\], got"):
         model.sample(params, jax.random.key(0), obs, action[:5])
 
 
