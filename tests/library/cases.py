@@ -10,7 +10,7 @@ import optax
 import toys
 
 import jaxpets
-from jaxpets import PlanParams
+from jaxpets import PlanParams, policies
 from jaxpets.envs import env_rollout
 from jaxpets.envs import half_cheetah as hc
 
@@ -19,6 +19,16 @@ MODELS = jax.jit(jax.vmap(MODEL.init))(jax.random.split(jax.random.key(0), 3))
 ENV = toys.cart_env()
 RND = jaxpets.rewards.random_network_distillation(
     optax.adam(1e-3), obs_size=2, hidden_size=8, num_features=4
+)
+TASK = policies.actor_critic(
+    toys.cart,
+    toys.reach,
+    optax.adam(1e-3),
+    policies.ActorCriticConfig(hidden_size=8),
+    jaxpets.delta_space(),
+    obs_size=2,
+    action_low=ENV.action_low,
+    action_high=ENV.action_high,
 )
 NOISY = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=4)
 LEARNED = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
@@ -133,6 +143,19 @@ def jittered(gain, key, obs, action):
     return toys.cart(gain, None, obs, action) + 0.01 * noise
 
 
+def guided(i):
+    params = PlanParams(jnp.float32(1.0), jnp.float32(i))
+    networks = TASK.init(params, key_of(i), dataset(i)).params
+    return policies.Guided(params.reward, networks)
+
+
+def policy_case():
+    def variant(i):
+        return PlanParams((), guided(i)), key_of(i), (), cart_obs(i)
+
+    return Case(TASK.policy.step, variant, (2, 1))
+
+
 CASES = {
     **{f"plan-{n}": functools.partial(planner_case, n) for n in toys.OPTIMIZERS},
     "random_planner": lambda: planner_case("random"),
@@ -172,6 +195,8 @@ CASES = {
         hc.task_reward,
         lambda i: (jax.tree.map(lambda x: x[i], hc.tasks()), *step_of(i, 18, 6)),
     ),
+    "policy": policy_case,
+    "guided-reward": lambda: Case(TASK.reward_fn, lambda i: (guided(i), *step_of(i))),
     "user-reward": lambda: Case(toys.reach, lambda i: (jnp.float32(i), *step_of(i))),
     "ensemble_std": lambda: Case(
         jaxpets.rewards.ensemble_std, lambda i: ((), *step_of(i))
