@@ -11,6 +11,7 @@ from unittest import mock
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -113,3 +114,19 @@ def test_a_gymnasium_robot_goes_from_exploration_to_two_tasks():
     assert all(-1.0 <= height <= 1.0 for height in heights)
     # Two tasks, one program.
     assert agent._acts[names["actor"]]._cache_size() == 1
+
+
+@pytest.mark.slow
+def test_the_tour_explores_draws_and_performs_what_is_typed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # it leaves pictures
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names, lines = run("tour.py", "--tiny")
+    assert len(lines) == 2 + len(names["LINES"])
+    assert all(np.isfinite(numbers(line)).all() for line in lines)
+    # Three rewards, one program.
+    assert names["perform"]._cache_size() == 1
+    values = names["disagreement"](names["state"])
+    assert values.shape == (61 * 41,) and bool(jnp.all(values > 0.0))
+    with Image.open("pendulum.gif") as film:
+        assert film.n_frames == 10
+    assert Path("disagreement.png").stat().st_size > 10_000
