@@ -6,7 +6,7 @@ verb act. (`plan` builds too: a rollout, a reward and a search become a planner.
 Nothing is jitted, keeps state or draws from a global key. All arrays are float32, and
 all keys typed (`jax.random.key`).
 
-The shapes in the docstrings have these letters:
+The shapes in the docstrings have these letters::
 
   N  candidate action sequences (num_samples)
   H  planning horizon
