@@ -8,6 +8,7 @@ import inspect
 from pathlib import Path
 from typing import Any
 
+import jupytext
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.addnodes import pending_xref
@@ -17,7 +18,9 @@ from sphinx.util import logging
 
 import jaxpets
 from jaxpets import coordinates, envs, formulas, models
-from jaxpets.envs import half_cheetah
+
+ROOT = Path(__file__).parents[1]
+LOG = logging.getLogger(__name__)
 
 project = "jaxpets"
 version = release = jaxpets.__version__
@@ -40,15 +43,14 @@ include_patterns = [
     "results/*.md",
     "results/*/report/report.md",
 ]
-_FOLDERS = {pattern.partition("/")[0] for pattern in include_patterns}
+_folders = {pattern.partition("/")[0] for pattern in include_patterns}
 exclude_patterns = ["docs/_build"] + [
-    path.name
-    for path in Path(__file__).parents[1].iterdir()
-    if path.is_dir() and path.name not in _FOLDERS
+    path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _folders
 ]
 
-myst_enable_extensions = ["dollarmath", "deflist"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4  # as the code's host names them
+linkcheck_anchors = False  # of pages that are programs
 default_role = "py:obj"  # what stands in backticks in a docstring is linked
 add_module_names = False
 autodoc_member_order = "bysource"
@@ -66,45 +68,75 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 copybutton_prompt_text = ">>> "
 
-MODULES = [
-    jaxpets, coordinates, jaxpets.datasets, envs, formulas, half_cheetah, models,
-    jaxpets.optimizers, jaxpets.rewards, jaxpets.typing,
-]  # fmt: skip
+# Modules with public names, and whether these go without their module in a text.
+MODULES = {
+    jaxpets: True,
+    jaxpets.optimizers: True,
+    jaxpets.rewards: True,
+    coordinates: False,
+    jaxpets.datasets: False,
+    envs: False,
+    formulas: False,
+    models: False,
+    jaxpets.typing: True,
+}
+PUBLIC = {
+    f"{module.__name__}.{name}": getattr(module, name)
+    for module in MODULES
+    for name in module.__all__
+}
+# Full names by what a text calls them; the first module that has a name owns it.
+BARE: dict[str, list[str]] = {}
+for _module, _alone in MODULES.items():
+    for _name in _module.__all__ if _alone else ():
+        BARE.setdefault(_name, []).append(f"{_module.__name__}.{_name}")
 
 
-def public_names() -> dict[str, Any]:
-    """Returns everything public by its full name."""
-    return {
-        f"{module.__name__}.{name}": getattr(module, name)
-        for module in MODULES
-        for name in getattr(module, "__all__", ())
-    }
+def called(text: str) -> list[str]:
+    """Returns the full names that a text may mean."""
+    last = text.rpartition(".")[2]
+    full = [name for name in (text, f"jaxpets.{text}") if name in PUBLIC]
+    same = [name for name, x in PUBLIC.items() if full and x is PUBLIC[full[0]]]
+    private = text.startswith("jaxpets._src.") or text == last
+    return [*full, *same, *(BARE.get(last, []) if private else [])]
+
+
+def link_names(app: Sphinx, doctree: nodes.document) -> None:
+    """Links what stands in backticks in a page to where it is described.
+
+    In the accounts of results a name without its module is that of an arm.
+    """
+    page = app.env.docname
+    ours = page == "README" or page.startswith("docs/")
+    for node in list(doctree.findall(nodes.literal)):
+        text = node.astext()
+        inside = isinstance(node.parent, nodes.reference | pending_xref)
+        if not inside and called(text) and ("." in text or ours):
+            about = {"refdomain": "py", "reftype": "obj", "reftarget": text}
+            node.replace_self(pending_xref("", node.deepcopy(), refdoc=page, **about))
 
 
 def resolve(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element
 ) -> nodes.Element | None:
     """Links a name by which the code knows a thing to where the thing is described."""
-    domain, target = env.get_domain("py"), node["reftarget"]
-    name = target.rpartition(".")[2]
-    known = domain.objects  # pyright: ignore[reportAttributeAccessIssue]
-    found = [full for full in public_names() if full.endswith(f".{name}")]
-    for full in found:
-        if full in known and (target == name or target.startswith("jaxpets.")):
+    domain: Any = env.get_domain("py")
+    for full in called(node["reftarget"]):
+        if full in domain.objects:
+            page = node["refdoc"]
             return domain.resolve_xref(
-                env, node["refdoc"], app.builder, "obj", full, node, content
+                env, page, app.builder, "obj", full, node, content
             )
     return None
 
 
 def check_public(app: Sphinx, env: BuildEnvironment) -> None:
     """Warns of every public thing that no page describes."""
-    known = env.get_domain("py").objects  # pyright: ignore[reportAttributeAccessIssue]
-    things = public_names()
-    described = {id(things[full]) for full in things.keys() & known.keys()}
-    for full, thing in things.items():
+    domain: Any = env.get_domain("py")
+    described = {id(PUBLIC[full]) for full in PUBLIC.keys() & domain.objects.keys()}
+    for full, thing in PUBLIC.items():
         if id(thing) not in described and not inspect.ismodule(thing):
-            logging.getLogger(__name__).warning("%s is on no page", full)
+            LOG.warning("%s is on no page", full)
 
 
 def inline_math(writer: Any, node: nodes.math) -> None:
@@ -120,8 +152,16 @@ def block_math(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def write_notebook(app: Sphinx) -> None:
+    """Writes the tour as Jupyter and Colab want it, for the front page to link to."""
+    tour = jupytext.read(ROOT / "examples" / "tour.py")
+    jupytext.write(tour, ROOT / "docs" / "_build" / "tour.ipynb")
+
+
 def setup(app: Sphinx) -> None:
     """Adds the above to Sphinx."""
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
+    app.connect("doctree-read", link_names)
     app.connect("missing-reference", resolve)
     app.connect("env-check-consistency", check_public)
+    app.connect("builder-inited", write_notebook)

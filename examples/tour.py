@@ -3,8 +3,9 @@
 #
 # A pendulum whose motor is too weak to lift it at once. Five networks learn how it
 # moves, while a planner seeks states about which they disagree. Then rewards are typed
-# as text. It takes a minute on two cores; as a script it is `python examples/tour.py`.
-# `jupytext --to ipynb` makes the notebook, which wants a wheel of jaxpets beside it:
+# as text. It takes two minutes on two cores; as a script it is `python
+# examples/tour.py`. `jupytext --to ipynb` makes the notebook, which wants a wheel of
+# jaxpets beside it:
 
 # %%
 # %pip install --quiet jaxpets-*.whl matplotlib

@@ -12,7 +12,7 @@ The shapes in the docstrings have these letters::
   H  planning horizon
   E  ensemble members
   P  particles per member (num_particles = E * P)
-  B  rows of one member's batch; N * P inside a rollout
+  B  rows of a batch of one member; N * P inside a rollout
   D  observation size
   F  size of what the network reads of an observation
   A  action size

@@ -24,17 +24,11 @@ from ..storage import disk, metrics, rundir
 from ..storage.folder import RunFolder
 from ..storage.metrics import Row, number
 
-# Zero-shots with the models that come along, and where they are.
 _RESULTS = Path(__file__).parents[2] / "results"
+# Zero-shots at the paper's size with the models that come along.
 _SHIPPED = {
-    "best": (
-        "paper/best-1-3/zero-shot-060-refit-400",
-        "pretrained-laptop/best/zero-shot-060",
-    ),
-    "epistemic": (
-        "paper-no-refit/epistemic-0/zero-shot-060",
-        "pretrained-laptop/epistemic/zero-shot-060",
-    ),
+    "best": "paper/best-1-3/zero-shot-060-refit-400",
+    "epistemic": "paper-no-refit/epistemic-0/zero-shot-060",
 }
 _SAID = ("environment", "licence", "training", "search")
 _HEAD = """---
@@ -59,7 +53,10 @@ _USAGE = """```python
 model, params = jaxpets.{load}
 rollout = jaxpets.fused_rollout(model, num_particles={particles})
 box = {{"action_low": env.action_low, "action_high": env.action_high}}
-search = jaxpets.optimizers.{optimizer}(**box, {settings})
+search = jaxpets.optimizers.{optimizer}(
+    **box,
+    {settings},
+)
 planner = jaxpets.plan(rollout, your_reward, search)
 plan, state = jax.jit(planner.step)(jaxpets.PlanParams(params), key, state, obs)
 ```"""
@@ -122,7 +119,8 @@ def text(file: Path, run: Path, returns: Sequence[Path] | None) -> str:
 
 def shipped(name: str) -> str:
     """Returns the card of a model that comes along."""
-    returns = [_RESULTS / folder for folder in _SHIPPED[name]]
+    folders = (_SHIPPED[name], f"pretrained-laptop/{name}/zero-shot-060")
+    returns = [_RESULTS / folder for folder in folders]
     return text(models.path(name), cli.PRETRAINED / name, returns)
 
 
@@ -182,7 +180,7 @@ def _usage(facts: _Facts) -> str:
         load=f'pretrained("{name}")' if shipped else f'load_model("{facts.file.name}")',
         particles=search["num_particles"],
         optimizer=search["optimizer"],
-        settings=", ".join(settings),
+        settings=",\n    ".join(settings),
     )
 
 
