@@ -62,6 +62,7 @@ napoleon_use_rtype = False
 
 html_theme = "furo"
 html_title = "jaxpets"
+html_show_copyright = False
 html_math_renderer = "mathml"
 html_extra_path = ["_root"]  # the way from the top to the front page
 html_static_path = ["_static"]
