@@ -1,16 +1,15 @@
 """`python -m experiments.run {explore,zero-shot,finetune,report}`: the command line."""
 
 import os
-import signal
 import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-from . import cli, robots, signals
+from . import calling, cli, robots, signals
 from .config import Config
 from .cost import check_cpu, memory_advice
 from .entries import differences, from_json, to_json
@@ -46,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _list(arguments[1:])
             return 0
         with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
-            with _without_gl():
+            with robots.without_gl():
                 plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
@@ -64,7 +63,7 @@ def _list(words: Sequence[str]) -> None:
     if list(words) != ["envs"]:
         said = " ".join(words) or "with no value"
         raise UsageError(f"--list {said} is not valid; it must be envs.")
-    with _without_gl(), _plain_errors(Config()):
+    with robots.without_gl(), _plain_errors(Config()):
         print(robots.listing("mujoco"), flush=True)
 
 
@@ -75,7 +74,7 @@ def _dispatch(config: Config) -> None:
         for path in report.write_report(config.out, config.out / "report"):
             distributed.say(f"wrote {path}")
         return
-    with _without_gl():
+    with robots.without_gl():
         run = _run(config)
     if config.video is not None and distributed.is_first():
         _video(config, run)
@@ -92,7 +91,7 @@ def _run(config: Config) -> "RunFolder":
             from . import phases
 
             phases.explore(config, run)
-        run.say(f"next: python -m experiments.run --phase zero-shot --from {run.path}")
+        run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
         return run
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
@@ -201,38 +200,5 @@ def _plain_warnings() -> Iterator[None]:
         yield
 
 
-@contextmanager
-def _without_gl() -> Iterator[None]:
-    """Lets mujoco be imported without OpenGL, which only a video's process needs.
-
-    A MUJOCO_GL that does not work here would end the run on that import.
-    """
-    chosen = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
-        yield
-    finally:
-        del os.environ["MUJOCO_GL"]
-        if chosen is not None:
-            os.environ["MUJOCO_GL"] = chosen
-
-
-def command() -> NoReturn:
-    """Runs `main` as a program, and leaves."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # While there is no run it ends the process. Python would raise it anywhere, and
-        # jax, where it looks for a GPU, takes that for a GPU that does not work.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    code: Any = 1
-    with signals.unheard():  # to the very end: threads of a failed save come last
-        try:
-            code = main()
-        except SystemExit as error:
-            code = error.code
-        except BaseException:
-            traceback.print_exc()
-        signals.leave(code)
-
-
 if __name__ == "__main__":
-    command()
+    signals.as_program(main)

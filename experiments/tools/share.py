@@ -1,7 +1,7 @@
 """`python -m experiments.tools.share RUN FILE`: a run's model as one file.
 
 What `jaxpets.load_model` reads, with the numbers that the run performs with. The files
-of `jaxpets.pretrained` were written by this, from `results/pretrained`.
+of `jaxpets.pretrained` were written by this, from `experiments/pretrained`.
 """
 
 import argparse
@@ -107,9 +107,7 @@ def _search(planner: PlannerConfig) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Shares a model; returns the exit code, as `experiments.run`."""
-    parser = argparse.ArgumentParser(
-        prog="experiments.tools.share", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog=f"{__package__}.share", description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an exploration run")
     parser.add_argument("file", type=Path, help="as model.safetensors")
     parser.add_argument("--seed", type=int, help="by default the run's first")
