@@ -4,8 +4,8 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,14 +74,13 @@ def _dispatch(config: Config) -> None:
         for path in report.write_report(config.out, config.out / "report"):
             distributed.say(f"wrote {path}")
         return
-    with robots.without_gl():
-        run = _run(config)
-    if config.video is not None and distributed.is_first():
-        _video(config, run)
+    with ExitStack() as stack:
+        stack.enter_context(robots.without_gl())
+        _run(config, stack.close)
 
 
-def _run(config: Config) -> "RunFolder":
-    """Runs a phase that leaves a folder, and returns that."""
+def _run(config: Config, with_gl: Callable[[], None]) -> None:
+    """Runs a phase that leaves a folder; `with_gl` allows what comes after OpenGL."""
     from .storage.folder import RunFolder
 
     check_cpu(config)
@@ -92,7 +91,7 @@ def _run(config: Config) -> "RunFolder":
 
             phases.explore(config, run)
         run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
-        return run
+        return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
     with _opened(config, folder) as run:
@@ -100,7 +99,9 @@ def _run(config: Config) -> "RunFolder":
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
         phase(config, source, run, step)
-    return run
+        if config.video is not None and distributed.is_first():
+            with_gl()
+            _video(config, run, step)
 
 
 def _variant(config: Config, step: int) -> str:
@@ -144,7 +145,7 @@ def _explored_step(config: Config, source: "RunFolder") -> int:
     return step
 
 
-def _video(config: Config, run: "RunFolder") -> None:
+def _video(config: Config, run: "RunFolder", step: int) -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
     from .tools import video
 
@@ -167,6 +168,7 @@ def _video(config: Config, run: "RunFolder") -> None:
             distributed.say(f"warning: no video; the run is complete: {error}")
             return
         distributed.say(f"wrote {target}")
+        run.track_video(step, name, target)
 
 
 @contextmanager
