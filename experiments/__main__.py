@@ -20,6 +20,7 @@ _PHASES = {
 # Modules with a `main` of their own, by the word that calls them.
 _OTHERS = {
     "status": "show what runs do, or how they ended",
+    "compare": "show what differs between runs",
     "doctor": "say whether runs can start here, and what would help",
 }
 _ABOUT = f"""usage: {COMMAND} WORD [FLAG ...]
