@@ -11,6 +11,8 @@ import importlib.util
 import io
 import json
 import os
+import struct
+import subprocess
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -167,7 +169,8 @@ def _tensorboard(about: About) -> Tracker:
         writer.flush()
 
     def video(step: int, name: str, path: Path) -> None:
-        gif, (height, width) = _gif(path)
+        gif = _gif(path)
+        width, height = struct.unpack("<HH", gif[6:10])
         image = proto.Summary.Image(
             height=height, width=width, colorspace=3, encoded_image_string=gif
         )
@@ -240,23 +243,10 @@ def _trackio(about: About) -> Tracker:
 _OPEN = {"tensorboard": _tensorboard, "wandb": _wandb, "trackio": _trackio}
 
 
-def _gif(path: Path) -> tuple[bytes, tuple[int, int]]:
-    """Returns a video as a small GIF of every fourth picture, and its size."""
+def _gif(path: Path) -> bytes:
+    """Returns a video at half its size, five pictures a second."""
     import imageio_ffmpeg
-    from PIL import Image
 
-    frames = imageio_ffmpeg.read_frames(str(path))
-    about = next(frames)
-    size = about["size"]
-    small = (size[0] // 2, size[1] // 2)
-    pictures = [
-        Image.frombytes("RGB", size, frame).resize(small)
-        for i, frame in enumerate(frames)
-        if not i % 4
-    ]
-    file = io.BytesIO()
-    pictures[0].save(
-        file, format="GIF", save_all=True, append_images=pictures[1:],
-        duration=round(4000 / about["fps"]), loop=0,
-    )  # fmt: skip
-    return file.getvalue(), small[::-1]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", f"file:{path}"]
+    command += ["-vf", "fps=5,scale=iw/2:-1", "-f", "gif", "-"]
+    return subprocess.run(command, check=True, capture_output=True).stdout
