@@ -164,7 +164,8 @@ def _opengl() -> Iterator[Finding]:
 
 def _machine() -> Iterator[Finding]:
     """Cores, memory, and the disk that runs are written to."""
-    cores = len(os.sched_getaffinity(0))
+    own = getattr(os, "sched_getaffinity", None)  # which Linux has
+    cores = len(own(0)) if own else os.cpu_count()
     yield Finding(Mark.GOOD, f"cores: {cores}, {platform.machine()}")
     free = _free_memory()
     if free is not None:
