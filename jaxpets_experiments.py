@@ -1,4 +1,7 @@
-"""The folder `experiments` by the name that a wheel gives it, for editable installs."""
+"""The folder `experiments` by the name that a wheel gives it, for editable installs.
+
+Hatchling renames a folder in a wheel only: an editable install of it is a path.
+"""
 
 from pathlib import Path
 
