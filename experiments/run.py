@@ -22,6 +22,7 @@ from .errors import (
     last_line,
 )
 from .parallel import distributed
+from .progress import Watch
 from .storage import rundir
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
@@ -31,7 +32,7 @@ if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
 _NEEDED_BYTES = 64 * 2**20
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, watch: Watch | None = None) -> int:
     """Runs one phase and returns the exit code.
 
     0 done, 1 a bug, 2 usage, 3 checkpoint, 4 diverged, 5 storage, 6 out of memory,
@@ -49,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
-                _dispatch(config)
+                _dispatch(config, watch or Watch())
     except RunError as error:
         if "--debug" in arguments:
             traceback.print_exc()
@@ -67,7 +68,7 @@ def _list(words: Sequence[str]) -> None:
         print(robots.listing("mujoco"), flush=True)
 
 
-def _dispatch(config: Config) -> None:
+def _dispatch(config: Config, watch: Watch) -> None:
     if config.phase == "report":
         from .report import report
 
@@ -76,10 +77,10 @@ def _dispatch(config: Config) -> None:
         return
     with ExitStack() as stack:
         stack.enter_context(robots.without_gl())
-        _run(config, stack.close)
+        _run(config, stack.close, watch)
 
 
-def _run(config: Config, with_gl: Callable[[], None]) -> None:
+def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
     """Runs a phase that leaves a folder; `with_gl` allows what comes after OpenGL."""
     from .storage.folder import RunFolder
 
@@ -89,7 +90,7 @@ def _run(config: Config, with_gl: Callable[[], None]) -> None:
         with _opened(config, source.path) as run:
             from . import phases
 
-            phases.explore(config, run)
+            phases.explore(config, run, watch)
         run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
         return
     step = _explored_step(config, source)
@@ -98,10 +99,10 @@ def _run(config: Config, with_gl: Callable[[], None]) -> None:
         from . import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
-        phase(config, source, run, step)
+        phase(config, source, run, step, watch)
         if config.video is not None and distributed.is_first():
             with_gl()
-            _video(config, run, step)
+            _video(config, run, step, watch)
 
 
 def _variant(config: Config, step: int) -> str:
@@ -145,13 +146,15 @@ def _explored_step(config: Config, source: "RunFolder") -> int:
     return step
 
 
-def _video(config: Config, run: "RunFolder", step: int) -> None:
+def _video(config: Config, run: "RunFolder", step: int, watch: Watch) -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
     from .tools import video
 
     assert config.video is not None
     names = robots.chosen(config, robots.of(config)).names
-    for name in names:
+    for i, name in enumerate(names):
+        watch.begin("video")
+        watch.says(f"video {i + 1} of {len(names)}")
         target = config.video
         if len(names) > 1:
             target = target.with_stem(f"{target.stem}-{name}")
@@ -167,6 +170,7 @@ def _video(config: Config, run: "RunFolder", step: int) -> None:
         except RunError as error:
             distributed.say(f"warning: no video; the run is complete: {error}")
             return
+        watch.did("video", 1)
         distributed.say(f"wrote {target}")
         run.track_video(step, name, target)
 
