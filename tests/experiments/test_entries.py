@@ -139,8 +139,8 @@ def test_what_a_run_is_does_not_depend_on_where_it_is_or_how_it_is_computed():
     may_change = {entry.name for entry in entries(Config)}
     may_change -= {entry.name for entry in entries(Run)}
     assert may_change == {
-        "out", "name", "video", "source", "at_trial", "chunk_length", "allow_cpu",
-        "debug", "coordinator_address", "num_processes", "process_id",
+        "out", "name", "track", "video", "source", "at_trial", "chunk_length",
+        "allow_cpu", "debug", "coordinator_address", "num_processes", "process_id",
     }  # fmt: skip
     config = PRESETS["smoke"]
     elsewhere = dataclasses.replace(config, name="x", chunk_length=1, allow_cpu=True)
