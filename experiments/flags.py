@@ -147,6 +147,7 @@ def completion(shell: str, others: Mapping[str, str]) -> str:
         name: dataclasses.make_dataclass(name, [], namespace={"__doc__": text})
         for name, text in others.items()
     }
+    plain["study"] = Explore  # whose flags it takes
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         tyro.extras.subcommand_cli_from_dict(

@@ -106,6 +106,7 @@ def test_bash_completes_words_flags_and_values(tmp_path, capsys):
         "": set(WORDS),
         "zero": {"zero-shot"},
         "explore --planner.hor": {"--planner.horizon"},
+        "study --num-tr": {"--num-trials"},
         "explore --preset ": {"laptop", "paper", "smoke"},
     }
     for line, wanted in tries.items():
