@@ -53,7 +53,6 @@ class Forecast:
             self._done, self._ahead = done, self._whole(done)
         for earlier in itertools.takewhile(lambda name: name != phase, _PHASES):
             self._ahead |= dict.fromkeys(_PHASES[earlier], 0)
-        self._phase = phase
 
     def did(self, kind: str, units: int, seconds: float, *, first: bool) -> None:
         """Takes notice of work.
@@ -80,18 +79,19 @@ class Forecast:
         """Returns the seconds that are left, None while nothing is known yet.
 
         Args:
-          waited: the seconds since the last work was done or a phase began.
+          waited: the seconds since the last work was done or a phase began; no more
+            of them count than a unit takes.
         """
-        now = later = 0.0
+        under_way, total = None, 0.0
         for kind, units in self._ahead.items():
-            each = self._each(kind) if units else 0.0
+            if not units:
+                continue
+            each = self._each(kind)
             if each is None:
                 return None
-            if kind in _PHASES[self._phase]:
-                now += units * each
-            else:
-                later += units * each
-        return max(now - waited, 0.0) + later
+            under_way = each if under_way is None else under_way
+            total += units * each
+        return total - min(waited, under_way or 0.0)
 
     def _whole(self, done: int) -> dict[str, int]:
         """Returns the units of a study that has explored for so many steps."""

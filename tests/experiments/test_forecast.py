@@ -50,9 +50,11 @@ def told(trials, step, video, compiling=25.0):
     steps("zero-shot", SIZES.task_length, step, 1.2 * compiling)
     for _ in range(SIZES.num_videos):
         forecast.begin("video")
+        patient, impatient = forecast.left(), forecast.left(1000.0)
+        assert patient and impatient and patient - impatient <= max(video, 25.0)
         did("video", 1, video)
     forecast.begin("report")
-    assert (forecast.left(), forecast.left(REPORT - 1)) == (REPORT, 1.0)
+    assert [forecast.left(x) for x in (0.0, 9.0, 99.0)] == [REPORT, 1.0, 0.0]
     return said, now + REPORT
 
 
