@@ -16,9 +16,7 @@ $(VENV)/.installed: pyproject.toml
 
 # The main job: explore without a reward, perform four tasks, report.
 explore: $(VENV)/.installed
-	$(BIN)/python -m experiments.run --phase explore --out $(OUT)
-	$(BIN)/python -m experiments.run --phase zero-shot --out $(OUT) --video $(OUT)/cheetah.mp4
-	$(BIN)/python -m experiments.run --phase report --out $(OUT)
+	$(BIN)/python -m experiments.study --out $(OUT)
 
 # The reports on the committed runs, from their logs, the cards of the models that come
 # along, and the picture of the method.

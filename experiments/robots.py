@@ -1,7 +1,9 @@
 """Which robot a run is about, and what it may perform."""
 
+import contextlib
 import functools
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -49,6 +51,22 @@ def named(env: str, engine: str, tasks: str | None = None) -> "Robot":
         return _checked(robot._replace(tasks=envs.tasks_of(rewards)))
 
     return user_files.made("--tasks", tasks, "tasks", with_tasks)
+
+
+@contextlib.contextmanager
+def without_gl() -> Iterator[None]:
+    """Lets mujoco be imported without OpenGL, which only a video's process needs.
+
+    A MUJOCO_GL that does not work here would end the run on that import.
+    """
+    chosen = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if chosen is not None:
+            os.environ["MUJOCO_GL"] = chosen
 
 
 def listing(engine: str) -> str:

@@ -1,16 +1,15 @@
 """`python -m experiments.run {explore,zero-shot,finetune,report}`: the command line."""
 
 import os
-import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-from . import cli, robots, signals
+from . import calling, cli, robots, signals
 from .config import Config
 from .cost import check_cpu, memory_advice
 from .entries import differences, from_json, to_json
@@ -23,6 +22,7 @@ from .errors import (
     last_line,
 )
 from .parallel import distributed
+from .progress import Watch
 from .storage import rundir
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
 _NEEDED_BYTES = 64 * 2**20
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, watch: Watch | None = None) -> int:
     """Runs one phase and returns the exit code.
 
     0 done, 1 a bug, 2 usage, 3 checkpoint, 4 diverged, 5 storage, 6 out of memory,
@@ -46,11 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             _list(arguments[1:])
             return 0
         with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
-            with _without_gl():
+            with robots.without_gl():
                 plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
-                _dispatch(config)
+                _dispatch(config, watch or Watch())
     except RunError as error:
         if "--debug" in arguments:
             traceback.print_exc()
@@ -64,25 +64,24 @@ def _list(words: Sequence[str]) -> None:
     if list(words) != ["envs"]:
         said = " ".join(words) or "with no value"
         raise UsageError(f"--list {said} is not valid; it must be envs.")
-    with _without_gl(), _plain_errors(Config()):
+    with robots.without_gl(), _plain_errors(Config()):
         print(robots.listing("mujoco"), flush=True)
 
 
-def _dispatch(config: Config) -> None:
+def _dispatch(config: Config, watch: Watch) -> None:
     if config.phase == "report":
         from .report import report
 
         for path in report.write_report(config.out, config.out / "report"):
             distributed.say(f"wrote {path}")
         return
-    with _without_gl():
-        run = _run(config)
-    if config.video is not None and distributed.is_first():
-        _video(config, run)
+    with ExitStack() as stack:
+        stack.enter_context(robots.without_gl())
+        _run(config, stack.close, watch)
 
 
-def _run(config: Config) -> "RunFolder":
-    """Runs a phase that leaves a folder, and returns that."""
+def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
+    """Runs a phase that leaves a folder; `with_gl` allows what comes after OpenGL."""
     from .storage.folder import RunFolder
 
     check_cpu(config)
@@ -91,17 +90,19 @@ def _run(config: Config) -> "RunFolder":
         with _opened(config, source.path) as run:
             from . import phases
 
-            phases.explore(config, run)
-        run.say(f"next: python -m experiments.run --phase zero-shot --from {run.path}")
-        return run
+            phases.explore(config, run, watch)
+        run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
+        return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
     with _opened(config, folder) as run:
         from . import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
-        phase(config, source, run, step)
-    return run
+        phase(config, source, run, step, watch)
+        if config.video is not None and distributed.is_first():
+            with_gl()
+            _video(config, run, step, watch)
 
 
 def _variant(config: Config, step: int) -> str:
@@ -145,13 +146,15 @@ def _explored_step(config: Config, source: "RunFolder") -> int:
     return step
 
 
-def _video(config: Config, run: "RunFolder") -> None:
+def _video(config: Config, run: "RunFolder", step: int, watch: Watch) -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
     from .tools import video
 
     assert config.video is not None
     names = robots.chosen(config, robots.of(config)).names
-    for name in names:
+    for i, name in enumerate(names):
+        watch.begin("video")
+        watch.says(f"video {i + 1} of {len(names)}")
         target = config.video
         if len(names) > 1:
             target = target.with_stem(f"{target.stem}-{name}")
@@ -167,7 +170,9 @@ def _video(config: Config, run: "RunFolder") -> None:
         except RunError as error:
             distributed.say(f"warning: no video; the run is complete: {error}")
             return
+        watch.did("video", 1)
         distributed.say(f"wrote {target}")
+        run.track_video(step, name, target)
 
 
 @contextmanager
@@ -201,38 +206,5 @@ def _plain_warnings() -> Iterator[None]:
         yield
 
 
-@contextmanager
-def _without_gl() -> Iterator[None]:
-    """Lets mujoco be imported without OpenGL, which only a video's process needs.
-
-    A MUJOCO_GL that does not work here would end the run on that import.
-    """
-    chosen = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
-        yield
-    finally:
-        del os.environ["MUJOCO_GL"]
-        if chosen is not None:
-            os.environ["MUJOCO_GL"] = chosen
-
-
-def command() -> NoReturn:
-    """Runs `main` as a program, and leaves."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # While there is no run it ends the process. Python would raise it anywhere, and
-        # jax, where it looks for a GPU, takes that for a GPU that does not work.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    code: Any = 1
-    with signals.unheard():  # to the very end: threads of a failed save come last
-        try:
-            code = main()
-        except SystemExit as error:
-            code = error.code
-        except BaseException:
-            traceback.print_exc()
-        signals.leave(code)
-
-
 if __name__ == "__main__":
-    command()
+    signals.as_program(main)

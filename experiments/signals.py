@@ -14,6 +14,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import Any, NoReturn
@@ -32,6 +33,23 @@ class Stop:
         """How long it has, from the first signal on."""
         self.tell: Callable[[str], None] = lambda reason: None
         """Called with the reason, from another thread, before the process ends."""
+
+
+def as_program(main: Callable[[], int]) -> NoReturn:
+    """Runs what returns an exit code as a program, and leaves."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # While there is no run it ends the process. Python would raise it anywhere, and
+        # jax, where it looks for a GPU, takes that for a GPU that does not work.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    code: Any = 1
+    with unheard():  # to the very end: threads of a failed save come last
+        try:
+            code = main()
+        except SystemExit as error:
+            code = error.code
+        except BaseException:
+            traceback.print_exc()
+        leave(code)
 
 
 @contextlib.contextmanager

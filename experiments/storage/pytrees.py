@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..parallel import distributed
+
 
 def describe(tree: Any) -> dict[str, dict[str, Any]]:
     """Returns `shape`, `dtype` and `key` of every leaf by path, as JSON values.
@@ -102,3 +104,16 @@ def _key_impl(leaf: Any) -> str:
     found = []
     jax.eval_shape(lambda key: found.append(str(jax.random.key_impl(key))), leaf)
     return found[0]
+
+
+def shared(state: Any, template: Any) -> Any:
+    """Gives every process the state that process 0 has read."""
+    if distributed.is_alone():
+        return state
+    arrays = {
+        name: np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"]))
+        for name, leaf in describe(template).items()
+    }
+    if state is not None:
+        arrays = to_host(state)
+    return from_host(distributed.share(arrays), template)

@@ -2,7 +2,7 @@
 
 What `jaxpets.load_model` reads, with the numbers that the run performs with, and a card
 beside it. The files of `jaxpets.pretrained` were written by this, from
-`results/pretrained`.
+`experiments/pretrained`.
 """
 
 import argparse
@@ -109,9 +109,7 @@ def _search(planner: PlannerConfig) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Shares a model; returns the exit code, as `experiments.run`."""
-    parser = argparse.ArgumentParser(
-        prog="experiments.tools.share", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog=f"{__package__}.share", description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an exploration run")
     parser.add_argument("file", type=Path, help="as model.safetensors")
     parser.add_argument("--seed", type=int, help="by default the run's first")

@@ -342,7 +342,7 @@ def test_a_robot_brings_numbers_of_its_own_to_the_laptop():
 def test_what_ends_a_run_is_a_line_and_its_status(
     out, capsys, monkeypatch, error, code, said
 ):
-    def explore(config, run):
+    def explore(config, run, watch):
         raise error
 
     monkeypatch.setattr(phases, "explore", explore)
@@ -355,7 +355,7 @@ def test_what_ends_a_run_is_a_line_and_its_status(
 
 
 def test_a_warning_is_one_line_without_its_source(out, capsys, monkeypatch):
-    def explore(config, run):
+    def explore(config, run, watch):
         warnings.warn("the kernel was built anew", stacklevel=1)
 
     monkeypatch.setattr(phases, "explore", explore)

@@ -95,7 +95,7 @@ def test_a_run_says_a_line_per_trial_and_nothing_else(straight):
         assert line.startswith(f"explore {trial}/{TRIAL}  value ")
         assert all(name in line for name in half_cheetah.TASK_NAMES)
         assert "steps/s" in line and "min left" in line
-    assert lines[-1].endswith(f"--phase zero-shot --from {folder}")
+    assert lines[-1].endswith(f"experiments.run zero-shot --from {folder}")
     assert status(folder) == "complete"
     assert json.loads((folder / "env.json").read_text())["backend"] == "cpu"
 
