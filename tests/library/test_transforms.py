@@ -97,7 +97,7 @@ def test_results_have_no_weak_types(name):
 def test_no_key_is_used_twice(name):
     case = case_of(name)
     with jax.debug_key_reuse(True):
-        jax.jit(functools.partial(case.fn))(*case.variant(0))
+        jax.jit(functools.partial(case.fn)).trace(*case.variant(0))  # as it checks then
 
 
 def test_the_checker_of_keys_works():
@@ -105,4 +105,4 @@ def test_the_checker_of_keys_works():
         return jax.random.normal(key) + jax.random.normal(key)
 
     with jax.debug_key_reuse(True), pytest.raises(jax.errors.KeyReuseError):
-        jax.jit(twice)(jax.random.key(0))
+        jax.jit(twice).trace(jax.random.key(0))
