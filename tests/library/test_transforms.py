@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import toys
 from cases import CASES, KEYED, STATEFUL
@@ -31,11 +32,17 @@ def expected(name, i):
 
 def stacked(name):
     variants = [case_of(name).variant(i) for i in range(3)]
-    return jax.tree.map(lambda *x: jnp.stack(x), *variants)
+    return jax.tree.map(stack, *variants)
+
+
+def stack(*leaves):
+    """Of arrays or keys; the former without a program."""
+    is_key = jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key)
+    return (jnp if is_key else np).stack(leaves)
 
 
 def at(tree, *index):
-    return jax.tree.map(lambda x: x[index], tree)
+    return jax.tree.map(lambda x: np.asarray(np.asarray(x)[index]), tree)
 
 
 # Outside of jit each operation of an unrolled search is compiled by itself; those with
@@ -51,7 +58,7 @@ def test_a_scan_of_vmap_equals_the_loop(name):
     def body(carry, args):
         return carry, jax.vmap(case_of(name).fn)(*args)
 
-    twice = jax.tree.map(lambda x: jnp.stack([x, x]), stacked(name))
+    twice = jax.tree.map(lambda x: stack(x, x), stacked(name))
     _, got = jax.jit(lambda xs: jax.lax.scan(body, 0, xs))(twice)
     for i in range(3):
         for turn in range(2):
