@@ -72,11 +72,11 @@ def test_a_trial_acts_learns_and_refreshes(key):
 
 def error_of(params):
     """Squared error of the mean model on states all over the cart's space."""
-    obs = jax.random.uniform(jax.random.key(9), (200, 2), jnp.float32, -1.0, 1.0)
-    action = jax.random.uniform(jax.random.key(8), (200, 1), jnp.float32, -1.0, 1.0)
-    shared = jnp.broadcast_to(obs, (3, 200, 2))
+    draw = np.random.default_rng(9).uniform
+    obs, action = (draw(-1, 1, (200, size)).astype(np.float32) for size in (2, 1))
+    shared = np.broadcast_to(obs, (3, 200, 2))
     mean, _ = jax.jit(MODEL.predict)(params, shared, action)
-    return float(jnp.mean((mean - toys.cart(1.0, None, shared, action)) ** 2))
+    return float(np.mean((mean - toys.cart(1.0, None, shared, action)) ** 2))
 
 
 def test_the_model_gets_better_and_the_planner_uses_it(key):
@@ -120,7 +120,7 @@ def test_learning_alone_equals_its_half_of_a_trial(key):
     state = INIT(key)
     transitions = toys.transitions(LENGTH)
     after, metrics = jax.jit(LEARNER.learn)(key, state, transitions)
-    dataset = jaxpets.datasets.append(state.dataset, transitions)
+    dataset = jax.jit(jaxpets.datasets.append)(state.dataset, transitions)
     want = jax.jit(FITTER.step)(state.params, key, state.fit, dataset)
     # Two programs, whose sums XLA may order differently.
     toys.assert_trees_close((after.params, after.fit, metrics), want, atol=1e-6)
