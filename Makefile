@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
+PIP_FLAGS ?=
 PYTEST_FLAGS ?=
 COVERAGE ?=
 
@@ -10,7 +11,8 @@ COVERAGE ?=
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+	  --editable ".[dev]"
 	touch $@
 
 # The main job: explore without a reward, perform four tasks, report.
