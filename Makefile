@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
+PIP_FLAGS ?=
 PYTEST_FLAGS ?=
 COVERAGE ?=
 DOCS = $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs . -b
@@ -11,7 +12,8 @@ DOCS = $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs . 
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+	  --editable ".[dev]"
 	touch $@
 
 # The main job: explore without a reward, perform four tasks, report.
@@ -41,7 +43,8 @@ lint: $(VENV)/.installed
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 $(VENV)/.documented: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+	  --editable ".[docs]"
 	touch $@
 
 # The site, in docs/_build/index.html; every warning is an error, and so is every link

@@ -38,9 +38,8 @@ def differences(
         for what in ("key", "shape", "dtype"):
             was, now = stored[name][what], wanted[name][what]
             if was != now:
-                was, now = (
-                    tuple(x) if what == "shape" else x or "raw" for x in (was, now)
-                )
+                shown = tuple if what == "shape" else lambda x: x or "raw"
+                was, now = shown(was), shown(now)
                 lines.append(f"{name} has {what} {was} (checkpoint) vs {now} (now)")
                 break
     return lines
@@ -48,10 +47,8 @@ def differences(
 
 def to_host(tree: Any) -> dict[str, np.ndarray]:
     """Copies every leaf to the host, keys as their data."""
-    raw = {
-        name: jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        for name, leaf in _named_leaves(tree).items()
-    }
+    leaves = _named_leaves(tree)
+    raw = {n: jax.random.key_data(x) if _is_key(x) else x for n, x in leaves.items()}
     return {name: np.asarray(leaf) for name, leaf in jax.device_get(raw).items()}
 
 

@@ -25,11 +25,14 @@ def params(model):
     params = jax.jit(model.init)(jax.random.key(0))
     leaves, tree = jax.tree.flatten(params.network)
     rng = np.random.default_rng(0)
-    moved = [x + jnp.asarray(0.3 * rng.normal(size=x.shape), x.dtype) for x in leaves]
+    moved = [
+        x + np.float32(0.3 * rng.normal(size=x.shape)) for x in map(np.asarray, leaves)
+    ]
+    moved = list(map(jnp.asarray, moved))
     network = jax.tree.unflatten(tree, moved)
     data = toys.transitions(50)
     return params._replace(
-        network=network, scaler=model.fit_scaler(data, jnp.int32(50))
+        network=network, scaler=jax.jit(model.fit_scaler)(data, jnp.int32(50))
     )
 
 
@@ -225,7 +228,7 @@ def test_scaler_equals_the_reference_on_the_rows_in_use(model):
 
 def test_scaler_of_nothing_is_the_identity(model):
     empty = jaxpets.datasets.init(8, D, A)
-    scaler = model.fit_scaler(empty.data, empty.size)
+    scaler = jax.jit(model.fit_scaler)(empty.data, empty.size)
     untrained = jax.jit(model.init)(jax.random.key(0))
     toys.assert_trees_close(scaler, untrained.scaler, rtol=0)
 
