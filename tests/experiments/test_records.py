@@ -89,6 +89,24 @@ def test_a_log_of_an_older_version_has_todays_names(tmp_path):
     assert (first.arm, first.seed, first.trial, first.data) == ("count-32", 1, 2, new)
 
 
+def test_no_bit_of_a_log_changes_unnoticed(tmp_path, capsys):
+    """A row with one flipped bit is left out, or says what it said."""
+    log, label = tmp_path / "metrics.jsonl", {"arm": "best", "seed": 1, "trial": 2}
+    row_ = metrics.row({"phase": "explore"} | label, 2.5, 0.25, {"forward": -3.0})
+    metrics.append_rows(log, [row_])
+    whole, kept = log.read_bytes(), 0
+    for i in range(8 * len(whole)):
+        data = bytearray(whole)
+        data[i // 8] ^= 1 << i % 8
+        log.write_bytes(data)
+        found = [x.data for x in metrics.read(log, {"preset": "smoke"})]
+        assert found == [] or row_.items() <= found[0].items()
+        assert metrics.rows_by_trial(log) == ({2: 1} if found else {})
+        kept += len(found)
+    assert kept < 8 * len("check")  # no flip was harmless but those of that name
+    assert "its check does not fit it" in capsys.readouterr().err
+
+
 def test_a_task_has_a_return_of_its_own():
     label = {"phase": "zero-shot", "task": "backward"}
     row_ = metrics.row(label, 2.0, 0.0, {"forward": 3.0, "backward": -3.0})
