@@ -15,7 +15,7 @@ A row is a trial of a seed, and of a task where one is sought:
     fit                      of the model after the trial, where there was one
     seconds                  act and fit
     constants, constants/... what was drawn for the trial, where anything is
-    check                    CRC-32 of the line as it is without this entry, the last
+    check                    a checksum of the other entries, whatever their order
 
 Null is a number that is not finite. The log is JSON Lines. A run that is resumed cuts
 it back to the trials that its checkpoint knows of, so that each trial is in it once.
@@ -231,23 +231,22 @@ def _orphans(path: Path) -> Path:
 
 
 def _lines(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    texts = (json.dumps(rundir.plain(row), allow_nan=False) for row in rows)
-    lines = (f'{text[:-1]}, "check": "{_check(text.encode())}"}}\n' for text in texts)
-    return "".join(lines).encode()
+    found = [rundir.plain(row) for row in rows]
+    found = [row | {"check": _check(row)} for row in found]
+    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in found).encode()
 
 
-def _check(text: bytes) -> str:
-    return f"{zlib.crc32(text):08x}"
+def _check(row: Mapping[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(row, sort_keys=True).encode()):08x}"
 
 
 def _checked(line: bytes) -> Any:
-    """Parses a line. A ValueError says why it is not as it was written."""
+    """Parses a line. A ValueError says why it is not what was written."""
     data = json.loads(line)
     if not isinstance(data, dict) or "check" not in data:  # of an older version
         return data
-    text, _, _ = line.rpartition(b', "check": ')
-    if data.pop("check") != _check(text + b"}"):
-        raise ValueError("its check does not fit it")
+    if data.pop("check") != _check(data):
+        raise ValueError("it has changed: its check is of another one")
     return data
 
 
