@@ -36,6 +36,11 @@ PHASES = {
     "finetune": ["--phase", "finetune", *RUN, "--task", "forward",
                  "--refit.num-epochs", "1"],
 }  # fmt: skip
+REFIT = "refit"  # of minutes, to be stopped
+COMMANDS = PHASES | {
+    REFIT: ["--phase", "zero-shot", *RUN, "--refit.num-epochs", "10000",
+            "--refit.batch-size", "1"],
+}  # fmt: skip
 
 
 class Fault(NamedTuple):
@@ -245,7 +250,7 @@ class Server:
         """Runs a phase in a folder; what it said is added to the answer."""
         said = Path(tempfile.mkdtemp(dir=folder)) / "said"
         request = {
-            "argv": [*PHASES[fault.phase], "--out", str(folder / "out")],
+            "argv": [*COMMANDS[fault.phase], "--out", str(folder / "out")],
             "out": str(said),
             "root": str(folder / "out"),
             "what": fault.what if fault.number else 0,
