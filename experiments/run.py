@@ -21,6 +21,7 @@ from .errors import (
     StorageError,
     UsageError,
     last_line,
+    stop_behind,
 )
 from .parallel import distributed
 from .storage import rundir
@@ -172,21 +173,30 @@ def _video(config: Config, run: "RunFolder") -> None:
 
 @contextmanager
 def _plain_errors(config: Config) -> Iterator[None]:
-    """Turns what the system says about memory and disk into one line."""
+    """Turns what the system says about signals, memory and disk into one line."""
     try:
         yield
-    except MemoryError as error:
-        raise OutOfMemoryError(memory_advice(config)) from error
-    except OSError as error:
+    except RunError:
+        raise
+    except Exception as error:
+        if (plain := _plain(error, config)) is None:
+            raise
+        raise plain from error
+
+
+def _plain(error: Exception, config: Config) -> RunError | None:
+    if (stop := stop_behind(error)) is not None:
+        return stop
+    full = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    if full or isinstance(error, MemoryError):
+        return OutOfMemoryError(memory_advice(config))
+    if isinstance(error, OSError):
         doing = f"use {error.filename}" if error.filename else "go on"
-        raise StorageError(
+        return StorageError(
             f"cannot {doing} ({error.strerror or error}). Check the disk, and what "
             "reads the output, and run the same command."
-        ) from error
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        raise OutOfMemoryError(memory_advice(config)) from error
+        )
+    return None
 
 
 @contextmanager
