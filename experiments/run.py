@@ -41,23 +41,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
     try:
-        # The library logs what a user cannot act on.
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-        if arguments[:1] == ["--list"]:
-            _list(arguments[1:])
-            return 0
-        with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
-            with _without_gl():
-                plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
-            config = from_json(plain, Config())
-            with _plain_errors(config):
-                _dispatch(config)
+        _main(arguments)
     except RunError as error:
-        if "--debug" in arguments:
-            traceback.print_exc()
-        signals.say(last_line(error))
-        return error.exit_code
+        return _told(error, arguments)
     return 0
+
+
+def _main(arguments: list[str]) -> None:
+    # The library logs what a user cannot act on.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    if arguments[:1] == ["--list"]:
+        return _list(arguments[1:])
+    with _plain_warnings(), distributed.joined(cli.process_spec(arguments)):
+        with _without_gl():
+            plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
+        config = from_json(plain, Config())
+        with _plain_errors(config):
+            _dispatch(config)
+
+
+def _told(error: RunError, arguments: list[str]) -> int:
+    """Tells the user why it ends, and returns the exit code."""
+    if "--debug" in arguments:
+        traceback.print_exception(error)
+    signals.say(last_line(error))
+    return error.exit_code
 
 
 def _list(words: Sequence[str]) -> None:
@@ -228,20 +236,26 @@ def _without_gl() -> Iterator[None]:
 
 
 def command() -> NoReturn:
-    """Runs `main` as a program, and leaves."""
+    """Runs `main` as a program, and leaves.
+
+    What an error holds is not freed before: programs of XLA that still run may use it.
+    """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # While there is no run it ends the process. Python would raise it anywhere, and
         # jax, where it looks for a GPU, takes that for a GPU that does not work.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    code: Any = 1
+    arguments = sys.argv[1:]
     with signals.unheard():  # to the very end: threads of a failed save come last
         try:
-            code = main()
+            _main(arguments)
+        except RunError as error:
+            signals.leave(_told(error, arguments))
         except SystemExit as error:
-            code = error.code
+            signals.leave(error.code)
         except BaseException:
             traceback.print_exc()
-        signals.leave(code)
+            signals.leave(1)
+        signals.leave(0)
 
 
 if __name__ == "__main__":
