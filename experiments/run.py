@@ -15,11 +15,13 @@ from .cost import check_cpu, memory_advice
 from .entries import differences, from_json, to_json
 from .errors import (
     CheckpointError,
+    ExitCode,
     OutOfMemoryError,
     RunError,
     StorageError,
     UsageError,
     last_line,
+    stop_behind,
 )
 from .parallel import distributed
 from .progress import Watch
@@ -55,7 +57,7 @@ def main(argv: Sequence[str] | None = None, watch: Watch | None = None) -> int:
         if "--debug" in arguments:
             traceback.print_exc()
         signals.say(last_line(error))
-        return error.exit_code
+        return ExitCode(error)
     return 0
 
 
@@ -177,21 +179,30 @@ def _video(config: Config, run: "RunFolder", step: int, watch: Watch) -> None:
 
 @contextmanager
 def _plain_errors(config: Config) -> Iterator[None]:
-    """Turns what the system says about memory and disk into one line."""
+    """Turns what the system says about signals, memory and disk into one line."""
     try:
         yield
-    except MemoryError as error:
-        raise OutOfMemoryError(memory_advice(config)) from error
-    except OSError as error:
+    except RunError:
+        raise
+    except Exception as error:
+        if (plain := _plain(error, config)) is None:
+            raise
+        raise plain from error
+
+
+def _plain(error: Exception, config: Config) -> RunError | None:
+    if (stop := stop_behind(error)) is not None:
+        return stop
+    full = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    if full or isinstance(error, MemoryError):
+        return OutOfMemoryError(memory_advice(config))
+    if isinstance(error, OSError):
         doing = f"use {error.filename}" if error.filename else "go on"
-        raise StorageError(
+        return StorageError(
             f"cannot {doing} ({error.strerror or error}). Check the disk, and what "
             "reads the output, and run the same command."
-        ) from error
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        raise OutOfMemoryError(memory_advice(config)) from error
+        )
+    return None
 
 
 @contextmanager

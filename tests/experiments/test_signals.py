@@ -47,6 +47,19 @@ DEAF = """
     signals.as_program(run.main)
 """
 
+# XLA may still be at work on what the frames of a run that was stopped hold.
+HELD = """
+    from experiments import cli, errors, run, signals
+    class Buffer:
+        def __del__(self):
+            print("freed", flush=True)
+    def parse(arguments):
+        buffer = Buffer()
+        raise errors.InterruptedRun("SIGTERM")
+    cli.parse = parse
+    signals.as_program(run.main)
+"""
+
 
 @pytest.fixture
 def hung_up():
@@ -76,6 +89,15 @@ def test_before_there_is_a_run_nothing_can_swallow_ctrl_c():
         argv, check=False, cwd=ROOT, capture_output=True, text=True, timeout=60
     )
     assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_what_a_stopped_run_holds_is_not_freed():
+    argv = [sys.executable, "-c", textwrap.dedent(HELD), "explore"]
+    found = subprocess.run(
+        argv, check=False, cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert (found.returncode, found.stdout) == (75, "")
+    assert found.stderr.startswith("stopped: SIGTERM; ")
 
 
 def test_what_nohup_ignores_stays_ignored(hung_up):

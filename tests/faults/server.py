@@ -71,6 +71,9 @@ def main() -> None:
     import experiments.run
     import experiments.storage.folder  # noqa: F401
 
+    # A run gets them also where the bench is under nohup, or a script's background.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     gc.freeze()
     answers = os.fdopen(os.dup(1), "w")
     print("ready", file=answers, flush=True)
