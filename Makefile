@@ -3,29 +3,32 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
+PIP_FLAGS ?=
 PYTEST_FLAGS ?=
 COVERAGE ?=
+DOCS = $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs . -b
 
-.PHONY: explore results test faults lint clean
+.PHONY: explore results test faults lint docs docs-links clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+	  --editable ".[dev]"
 	touch $@
 
 # The main job: explore without a reward, perform four tasks, report.
 explore: $(VENV)/.installed
-	$(BIN)/python -m experiments.run --phase explore --out $(OUT)
-	$(BIN)/python -m experiments.run --phase zero-shot --out $(OUT) --video $(OUT)/cheetah.mp4
-	$(BIN)/python -m experiments.run --phase report --out $(OUT)
+	$(BIN)/python -m experiments.study --out $(OUT)
 
-# The reports on the committed runs, from their logs, and the picture of the method.
+# The reports on the committed runs, from their logs, the cards of the models that come
+# along, and the picture of the method.
 results: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase report --out results/paper
 	$(BIN)/python -m experiments.run --phase report --out results/paper-no-refit
 	$(BIN)/python -m experiments.run --phase report --out results/laptop
 	cp results/paper/report/table1.json results/table1.json
 	$(BIN)/python -m experiments.report.method_figure results/method.svg
+	$(BIN)/python -m experiments.tools.card
 
 test: $(VENV)/.installed
 	$(BIN)/python $(COVERAGE) -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)
@@ -39,5 +42,18 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+$(VENV)/.documented: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+	  --editable ".[docs]"
+	touch $@
+
+# The site, in docs/_build/index.html; every warning is an error, and so is every link
+# that leads nowhere. `make docs-links` asks the network about the others.
+docs: $(VENV)/.documented
+	$(DOCS) html docs/_build
+
+docs-links: $(VENV)/.documented
+	$(DOCS) linkcheck docs/_build/linkcheck
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) docs/_build

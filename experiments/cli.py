@@ -30,7 +30,7 @@ from .validate import (
 )
 
 # Explored models that come with the code; see `experiments.tools.pretrained`.
-PRETRAINED = Path(__file__).parents[1] / "results" / "pretrained"
+PRETRAINED = Path(__file__).with_name("pretrained")
 
 
 def parse(argv: Sequence[str]) -> Config:

@@ -241,6 +241,8 @@ class Output:
     """Folder of all runs."""
     name: str | None = None
     """Name of the exploration run; by default PRESET-ARM, or PRESET-ROBOT-ARM."""
+    track: Literal["tensorboard", "wandb", "trackio"] | None = None
+    """Show the run in a tracker, too."""
 
 
 @dataclasses.dataclass(frozen=True)

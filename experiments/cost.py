@@ -1,4 +1,4 @@
-"""What planning costs: operations, hours on a CPU, and memory."""
+"""What planning and compiling cost: operations, hours on a CPU, memory, seconds."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,6 +9,22 @@ from .errors import UsageError
 
 # Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
 _CPU_FLOPS_AN_HOUR = 1e11 * 3600
+# Programs, and the seconds that they take to compile on two CPU cores, and on a GPU.
+_PROGRAMS = {"plan": ("planner", 30, 10), "fit": ("fit", 10, 8)}
+_PHYSICS = ("physics", 10, 10)  # MJX; physics in C takes none
+
+
+def compiling(program: str) -> str:
+    """Returns what is said while a program compiles.
+
+    Args:
+      program: plan, fit, or another planner, of which only physics takes long.
+    """
+    import jax
+
+    name, on_cpu, on_gpu = _PROGRAMS.get(program, _PHYSICS)
+    seconds = on_cpu if jax.default_backend() == "cpu" else on_gpu
+    return f"compiling the {name}, about {seconds} s, once"
 
 
 def model_flops(widths: Sequence[int]) -> float:

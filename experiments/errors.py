@@ -66,6 +66,31 @@ class StoppedTogether(InterruptedRun):
     """A signal that all processes know of, and stop for at the same point."""
 
 
+class ExitCode(int):
+    """The exit code of an error, which it keeps until the process is gone.
+
+    Programs of XLA that still run may use what the frames of the error hold.
+    """
+
+    error: RunError
+
+    def __new__(cls, error: RunError) -> "ExitCode":
+        """Takes the number from the error."""
+        code = super().__new__(cls, error.exit_code)
+        code.error = error
+        return code
+
+
+def stop_behind(error: BaseException | None) -> InterruptedRun | None:
+    """Returns the signal that an error comes from, if it does.
+
+    C code that calls Python and gets an exception back may raise one of its own.
+    """
+    while error is not None and not isinstance(error, InterruptedRun):
+        error = error.__cause__
+    return error and type(error)(*error.args)
+
+
 def last_line(error: RunError) -> str:
     """Returns what the user is told of the end of a run."""
     if isinstance(error, InterruptedRun):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 import jaxpets
 
@@ -130,6 +131,17 @@ def with_room(
 
     axes = jaxpets.SEED_AXES
     return jax.vmap(grown, (axes,), axes)(state)
+
+
+def branched(state: State, num_tasks: int, capacity: int) -> State:
+    """Copies the learner `[S]` once per task, `[S, K]`, with room for more data."""
+    state = with_room(state, capacity)._replace(reward=())
+
+    def repeat(x: jax.Array) -> jax.Array:
+        shared = x.ndim == 0
+        return x if shared else jnp.repeat(x[:, None], num_tasks, axis=1)
+
+    return jax.tree.map(repeat, state)
 
 
 def model_of(state: State) -> State:

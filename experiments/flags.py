@@ -3,7 +3,8 @@
 import contextlib
 import dataclasses
 import difflib
-from collections.abc import Sequence
+import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -15,6 +16,7 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
+from . import calling
 from .config import (
     Basics,
     Compute,
@@ -77,7 +79,6 @@ COMMANDS = {
     "finetune": Finetune,
     "report": Report,
 }
-_PROG = "experiments.run"
 _ABOUT = """Unsupervised exploration with deep model-based RL, of any robot.
 
 {}
@@ -112,7 +113,7 @@ def of(
         return_unknown_args=True,
         add_help=command is not None,
         registry=_AS_WRITTEN,
-        prog=f"{_PROG} {command}",
+        prog=calling.usage("run", command),
     )
     return read(role, _given(found), default, _refuse), rest
 
@@ -131,8 +132,30 @@ def explain(default: Config) -> None:
         default=part(default, Overview),
         description=_ABOUT.format("\n".join(phases)),
         registry=_AS_WRITTEN,
-        prog=f"{_PROG} {{{','.join(COMMANDS)}}}",
+        prog=calling.usage("run", f"{{{','.join(COMMANDS)}}}"),
     )
+
+
+def completion(shell: str, others: Mapping[str, str]) -> str:
+    """Returns what a shell must read to complete the command `jaxpets`.
+
+    Args:
+      shell: bash, zsh or fish.
+      others: what words that are not phases do.
+    """
+    plain = {
+        name: dataclasses.make_dataclass(name, [], namespace={"__doc__": text})
+        for name, text in others.items()
+    }
+    plain["study"] = Explore  # whose flags it takes
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        tyro.extras.subcommand_cli_from_dict(
+            {**COMMANDS, **plain},
+            args=["--tyro-print-completion", shell],
+            prog=calling.COMMAND,
+        )
+    return printed.getvalue()
 
 
 def beside(rest: Sequence[str], default: Config, command: str) -> Config:

@@ -9,12 +9,12 @@ from jax.sharding import PartitionSpec as P
 
 import jaxpets
 
-from . import acting, records
+from . import acting, cost, records
 from .acting import Scorer, Tick, Trials
 from .build import Learn, State
 from .parallel import devices
 from .parallel.devices import Placement
-from .progress import Progress
+from .progress import Progress, Watch
 from .storage.folder import RunFolder
 
 
@@ -57,8 +57,9 @@ class Phase(Protocol):
 
 
 def run(
-    folder: RunFolder, phase: Phase, state: State, first: int, done: int, last: int
-) -> bool:
+    folder: RunFolder, phase: Phase, state: State, first: int, done: int, last: int,
+    watch: Watch,
+) -> bool:  # fmt: skip
     """Runs what is left of the trials `first + 1` to `last`; saves after each.
 
     Args:
@@ -68,6 +69,7 @@ def run(
       first: the trial before the first of this run.
       done: the last one that is saved, `first` if none is.
       last: the one that completes the run.
+      watch: shows how far it is.
 
     Returns:
       Whether anything was left.
@@ -84,19 +86,29 @@ def run(
         folder.say(f"already complete: {last - first} of {last - first} trials.")
         return False
     state, steps = place(state), phase.trial_length
-    progress = Progress((last - first) * steps, (done - first) * steps, phase.name)
+    total, before = (last - first) * steps, (done - first) * steps
+    progress, compiled = Progress(total, before, phase.name, watch), set[str]()
+
+    def calls(program: str) -> None:
+        if program not in compiled:
+            progress.compiling(cost.compiling(program))
+        compiled.add(program)
+
     with progress.interruptible():
         for trial in range(done + 1, last + 1):
             act_keys, learn_keys = acting.split_keys(phase.keys(trial))
+            labels = phase.labels(trial)
+            calls(labels[0].get("planner", "plan"))
             begin = time.monotonic()
             acts = phase.act(trial, state, act_keys, progress.tick)
             trials = collect(acts)
             acted = time.monotonic()
+            calls("fit")
             state, fit = phase.learn(place(learn_keys), state, acts.transitions)
             jax.block_until_ready(state)
+            progress.did("fit", trial)
             seconds = {"act": acted - begin, "fit": time.monotonic() - acted}
             learned, fit = collect((state, fit))
-            labels = phase.labels(trial)
             rows = records.rows(phase.scorer, labels, trials, fit, learned.params)
             if trial == 1:
                 records.check_begun(rows, steps)

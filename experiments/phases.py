@@ -16,7 +16,7 @@ from jax import Array
 import jaxpets
 from jaxpets.envs import Tasks
 
-from . import acting, exploration, loop, records, robots
+from . import acting, cost, exploration, loop, records, robots
 from .acting import Actors, Scorer, Tick, Trials
 from .build import (
     EXPLORE,
@@ -33,7 +33,7 @@ from .build import (
 from .config import UNPLANNED, Config
 from .parallel import devices
 from .parallel.devices import SEED, TASK, Placement
-from .progress import Progress
+from .progress import Progress, Watch
 from .refit import refit
 from .report import coverage
 from .storage import rundir
@@ -120,7 +120,7 @@ class _Finetuning:
         ]
 
 
-def explore(config: Config, run: RunFolder) -> None:
+def explore(config: Config, run: RunFolder, watch: Watch) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
     _say_rollout(run, parts.explored_by)
@@ -145,7 +145,7 @@ def explore(config: Config, run: RunFolder) -> None:
     else:
         init = jax.vmap(parts.learner.init, out_axes=jaxpets.SEED_AXES)
         done, state = 0, jax.jit(init)(phase.keys(0))
-    went_on = loop.run(run, phase, state, 0, done, last)
+    went_on = loop.run(run, phase, state, 0, done, last, watch)
 
     def data(leaves: Mapping[str, Any]) -> State:
         return exploration.data_of(saved(leaves))
@@ -153,7 +153,9 @@ def explore(config: Config, run: RunFolder) -> None:
     coverage.write(run, robot.axes, config.seeds, data, max(done, last), anew=went_on)
 
 
-def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
+def zero_shot(
+    config: Config, source: RunFolder, run: RunFolder, step: int, watch: Watch
+) -> None:
     """Phase 2, at first: tasks planned with the explored model, nothing learned.
 
     The jump-start of Table 1. The model that acts is saved beside its log.
@@ -180,7 +182,8 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
         devices.place(placement, tasks.params, TASK),
     )
     num_chunks = config.task_length // config.chunk_length
-    progress = Progress(config.task_length, 0, "zero-shot")
+    progress = Progress(config.task_length, 0, "zero-shot", watch)
+    progress.compiling(cost.compiling("plan"))
     begin = time.monotonic()
     with progress.interruptible():
         trials = acting.run(actors, params, keys, num_chunks, progress.tick)
@@ -201,7 +204,9 @@ def zero_shot(config: Config, source: RunFolder, run: RunFolder, step: int) -> N
     run.say(records.summary(rows, names, time.monotonic() - begin))
 
 
-def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> None:
+def finetune(
+    config: Config, source: RunFolder, run: RunFolder, step: int, watch: Watch
+) -> None:
     """Phase 2, goes on: the loop of PETS with a task's reward, one branch per task.
 
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
@@ -229,11 +234,11 @@ def finetune(config: Config, source: RunFolder, run: RunFolder, step: int) -> No
         state = refit(config, parts, state, step, run)
     capacity = state.dataset.data.obs.shape[1]
     capacity += config.finetune_trials * config.task_length
-    init = _branch(state, len(tasks.names), capacity)
+    init = exploration.branched(state, len(tasks.names), capacity)
     data = exploration.data_of(jax.eval_shape(lambda: init))
     last = step + config.finetune_trials
     done, state = run.resume(init, step) or (step, init)
-    went_on = loop.run(run, phase, state, step, done, last)
+    went_on = loop.run(run, phase, state, step, done, last, watch)
     if went_on or not run.has_trajectories():
         if not went_on:
             run.say(f"{run.trajectories} is not whole: made again.")
@@ -282,14 +287,3 @@ def _placement(run: RunFolder, *counts: int) -> Placement:
     if line := devices.idle(placement):
         run.say(line)
     return placement
-
-
-def _branch(state: State, num_tasks: int, capacity: int) -> State:
-    """Copies the learner `[S]` once per task, `[S, K]`, with room for more data."""
-    state = exploration.with_room(state, capacity)._replace(reward=())
-
-    def repeat(x: Array) -> Array:
-        shared = x.ndim == 0
-        return x if shared else jnp.repeat(x[:, None], num_tasks, axis=1)
-
-    return jax.tree.map(repeat, state)

@@ -19,18 +19,37 @@ _BAR = (
 )
 
 
+class Watch:
+    """What else takes notice of how far a command is; here nothing does."""
+
+    has_bar = False
+    """Whether it draws a bar, in place of one for each phase."""
+
+    def begin(self, phase: str, done: int = 0) -> None:
+        """Takes notice of explore, zero-shot, finetune, videos or a report."""
+
+    def did(self, kind: str, units: int, *, first: bool = False) -> None:
+        """Takes notice of steps, of the trials that a fit was to, or of a video."""
+
+    def says(self, what: str) -> None:
+        """Takes notice of what is done now."""
+
+
 class Progress:
     """A bar over environment steps, lines per trial, and the wish to stop."""
 
-    def __init__(self, total: int, done: int, what: str) -> None:
+    def __init__(self, total: int, done: int, what: str, watch: Watch) -> None:
         self._shown = distributed.is_first()
+        self._watch, self._compiles = watch, False
+        watch.begin(what, done)
+        has_bar = self._shown and sys.stderr.isatty() and not watch.has_bar
         self._bar = tqdm.tqdm(
             total=total,
             initial=done,
             desc=what,
             unit=" steps",
             bar_format=_BAR,
-            disable=not (self._shown and sys.stderr.isatty()),
+            disable=not has_bar,
             dynamic_ncols=True,
             smoothing=0.1,
         )
@@ -45,10 +64,27 @@ class Progress:
         Raises:
           StoppedTogether: after a signal, on every host if one of them got it.
         """
+        self.did(self._what, steps)
         self._done += steps
         self._bar.update(steps)
         if number := distributed.agree(self._stop):
             raise StoppedTogether(signal.Signals(number).name)
+
+    def compiling(self, said: str) -> None:
+        """Says what is waited for until the next work is done."""
+        self._compiles = True
+        self._says(f"{self._what}: {said}")
+
+    def did(self, kind: str, units: int) -> None:
+        """Tells the watch of work that is done."""
+        self._watch.did(kind, units, first=self._compiles)
+        if self._compiles:
+            self._compiles = False
+            self._says(self._what)
+
+    def _says(self, what: str) -> None:
+        self._bar.set_description_str(what)
+        self._watch.says(what)
 
     def pace(self) -> tuple[float, float]:
         """Returns steps per second since the start, and the seconds that are left."""

@@ -4,24 +4,27 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-from . import cli, robots, signals
+from . import calling, cli, robots, signals
 from .config import Config
 from .cost import check_cpu, memory_advice
 from .entries import differences, from_json, to_json
 from .errors import (
     CheckpointError,
+    ExitCode,
     OutOfMemoryError,
     RunError,
     StorageError,
     UsageError,
     last_line,
+    stop_behind,
 )
 from .parallel import distributed
+from .progress import Watch
 from .storage import rundir
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
@@ -31,7 +34,7 @@ if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
 _NEEDED_BYTES = 64 * 2**20
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, watch: Watch | None = None) -> int:
     """Runs one phase and returns the exit code.
 
     0 done, 1 a bug, 2 usage, 3 checkpoint, 4 diverged, 5 storage, 6 out of memory,
@@ -49,12 +52,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 plain = distributed.on_first(lambda: to_json(cli.parse(arguments)))
             config = from_json(plain, Config())
             with _plain_errors(config):
-                _dispatch(config)
+                _dispatch(config, watch or Watch())
     except RunError as error:
         if "--debug" in arguments:
             traceback.print_exc()
         signals.say(last_line(error))
-        return error.exit_code
+        return ExitCode(error)
     return 0
 
 
@@ -67,21 +70,20 @@ def _list(words: Sequence[str]) -> None:
         print(robots.listing("mujoco"), flush=True)
 
 
-def _dispatch(config: Config) -> None:
+def _dispatch(config: Config, watch: Watch) -> None:
     if config.phase == "report":
         from .report import report
 
         for path in report.write_report(config.out, config.out / "report"):
             distributed.say(f"wrote {path}")
         return
-    with robots.without_gl():
-        run = _run(config)
-    if config.video is not None and distributed.is_first():
-        _video(config, run)
+    with ExitStack() as stack:
+        stack.enter_context(robots.without_gl())
+        _run(config, stack.close, watch)
 
 
-def _run(config: Config) -> "RunFolder":
-    """Runs a phase that leaves a folder, and returns that."""
+def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
+    """Runs a phase that leaves a folder; `with_gl` allows what comes after OpenGL."""
     from .storage.folder import RunFolder
 
     check_cpu(config)
@@ -90,17 +92,19 @@ def _run(config: Config) -> "RunFolder":
         with _opened(config, source.path) as run:
             from . import phases
 
-            phases.explore(config, run)
-        run.say(f"next: python -m experiments.run --phase zero-shot --from {run.path}")
-        return run
+            phases.explore(config, run, watch)
+        run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
+        return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / _variant(config, step)
     with _opened(config, folder) as run:
         from . import phases
 
         phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
-        phase(config, source, run, step)
-    return run
+        phase(config, source, run, step, watch)
+        if config.video is not None and distributed.is_first():
+            with_gl()
+            _video(config, run, step, watch)
 
 
 def _variant(config: Config, step: int) -> str:
@@ -144,13 +148,15 @@ def _explored_step(config: Config, source: "RunFolder") -> int:
     return step
 
 
-def _video(config: Config, run: "RunFolder") -> None:
+def _video(config: Config, run: "RunFolder", step: int, watch: Watch) -> None:
     """Renders the first trial of each task; failing at it does not fail the run."""
     from .tools import video
 
     assert config.video is not None
     names = robots.chosen(config, robots.of(config)).names
-    for name in names:
+    for i, name in enumerate(names):
+        watch.begin("video")
+        watch.says(f"video {i + 1} of {len(names)}")
         target = config.video
         if len(names) > 1:
             target = target.with_stem(f"{target.stem}-{name}")
@@ -166,26 +172,37 @@ def _video(config: Config, run: "RunFolder") -> None:
         except RunError as error:
             distributed.say(f"warning: no video; the run is complete: {error}")
             return
+        watch.did("video", 1)
         distributed.say(f"wrote {target}")
+        run.track_video(step, name, target)
 
 
 @contextmanager
 def _plain_errors(config: Config) -> Iterator[None]:
-    """Turns what the system says about memory and disk into one line."""
+    """Turns what the system says about signals, memory and disk into one line."""
     try:
         yield
-    except MemoryError as error:
-        raise OutOfMemoryError(memory_advice(config)) from error
-    except OSError as error:
+    except RunError:
+        raise
+    except Exception as error:
+        if (plain := _plain(error, config)) is None:
+            raise
+        raise plain from error
+
+
+def _plain(error: Exception, config: Config) -> RunError | None:
+    if (stop := stop_behind(error)) is not None:
+        return stop
+    full = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    if full or isinstance(error, MemoryError):
+        return OutOfMemoryError(memory_advice(config))
+    if isinstance(error, OSError):
         doing = f"use {error.filename}" if error.filename else "go on"
-        raise StorageError(
+        return StorageError(
             f"cannot {doing} ({error.strerror or error}). Check the disk, and what "
             "reads the output, and run the same command."
-        ) from error
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        raise OutOfMemoryError(memory_advice(config)) from error
+        )
+    return None
 
 
 @contextmanager
@@ -200,10 +217,5 @@ def _plain_warnings() -> Iterator[None]:
         yield
 
 
-def command() -> NoReturn:
-    """Runs `main` as a program, and leaves."""
-    signals.program(main)
-
-
 if __name__ == "__main__":
-    command()
+    signals.as_program(main)

@@ -35,6 +35,23 @@ class Stop:
         """Called with the reason, from another thread, before the process ends."""
 
 
+def as_program(main: Callable[[], int]) -> NoReturn:
+    """Runs what returns an exit code as a program, and leaves."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # While there is no run it ends the process. Python would raise it anywhere, and
+        # jax, where it looks for a GPU, takes that for a GPU that does not work.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    code: Any = 1
+    with unheard():  # to the very end: threads of a failed save come last
+        try:
+            code = main()
+        except SystemExit as error:
+            code = error.code
+        except BaseException:
+            traceback.print_exc()
+        leave(code)
+
+
 @contextlib.contextmanager
 def stoppable() -> Iterator[Stop]:
     """Turns the first signal into InterruptedRun, or into the end of the process.
@@ -103,23 +120,6 @@ def say(text: str) -> None:
     """Prints a last line for the user, who may be gone."""
     with contextlib.suppress(OSError, ValueError):
         print(text, file=sys.stderr, flush=True)
-
-
-def program(main: Callable[[], int]) -> NoReturn:
-    """Runs what a command does, and leaves with the exit code that it returns."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # While there is no run it ends the process. Python would raise it anywhere, and
-        # jax, where it looks for a GPU, takes that for a GPU that does not work.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    code: Any = 1
-    with unheard():  # to the very end: threads of a failed save come last
-        try:
-            code = main()
-        except SystemExit as error:
-            code = error.code
-        except BaseException:
-            traceback.print_exc()
-        leave(code)
 
 
 def leave(code: int) -> NoReturn:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from . import calling
 from .errors import CheckpointError, printable
 from .storage import rundir, status
 from .storage.status import Status
@@ -25,7 +26,7 @@ It only reads, and may be called while runs write."""
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints the table and returns the exit code: 2 if a folder is not there."""
     parser = argparse.ArgumentParser(
-        prog="experiments.status",
+        prog=calling.usage("status"),
         description="Shows the runs below folders: what each does, or how it ended.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

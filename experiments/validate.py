@@ -6,7 +6,7 @@ from typing import Any
 from .config import UNDIVIDED, Config, PlannerConfig
 from .entries import Mark, entries, flag
 from .errors import UsageError
-from .storage import rundir
+from .storage import rundir, trackers
 
 
 def require(holds: bool, flag: str, value: Any, valid: str) -> None:
@@ -21,6 +21,7 @@ def validate(config: Config) -> None:
     Raises:
       UsageError: naming the flag, the value and what would be valid.
     """
+    trackers.check(config.track)
     unique = 0 < len(config.seeds) == len(set(config.seeds))
     require(unique, "--seeds", config.seeds, "one or more different seeds")
     _check_members(config)

@@ -6,13 +6,13 @@ verb act. (`plan` builds too: a rollout, a reward and a search become a planner.
 Nothing is jitted, keeps state or draws from a global key. All arrays are float32, and
 all keys typed (`jax.random.key`).
 
-The shapes in the docstrings have these letters:
+The shapes in the docstrings have these letters::
 
   N  candidate action sequences (num_samples)
   H  planning horizon
   E  ensemble members
   P  particles per member (num_particles = E * P)
-  B  rows of one member's batch; N * P inside a rollout
+  B  rows of a batch of one member; N * P inside a rollout
   D  observation size
   F  size of what the network reads of an observation
   A  action size

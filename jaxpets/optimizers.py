@@ -2,7 +2,7 @@
 
 Numbers of a search that shape no array, as a temperature or a momentum, may be traced
 float32 scalars. Settings are then swept with one compilation, by building the search
-within the function that is mapped:
+within the function that is mapped::
 
     def value(temperature, key):
         search = mppi(temperature=temperature, ...)

@@ -155,11 +155,12 @@ def transitions(length, obs_size=2, action_size=1, seed=0):
     drift = 0.9 * obs + 0.3 * action.sum(-1, keepdims=True)
     next_obs = drift + 0.05 * rng.normal(size=obs.shape)
     rows = (obs, action, next_obs)
-    return jaxpets.Transition(*(jnp.asarray(x, jnp.float32) for x in rows))
+    return jaxpets.Transition(*(jnp.asarray(np.float32(x)) for x in rows))
 
 
+@functools.partial(jax.jit, static_argnames="capacity")
 def dataset_of(data, capacity=40):
-    """A dataset that holds `data`."""
+    """A dataset that holds `data`; one program, not one for each of its operations."""
     obs_size, action_size = data.obs.shape[1], data.action.shape[1]
     return jaxpets.datasets.append(
         jaxpets.datasets.init(capacity, obs_size, action_size), data

@@ -91,4 +91,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    signals.program(main)
+    signals.as_program(main)

@@ -127,7 +127,7 @@ def _write(rows: Sequence[Row], covered: Seen | None, out: Path, files: _Files) 
 
 def _draw(rows: Sequence[Row], found: Scores, explored: int, files: _Files) -> None:
     """Draws Figure 4 and what exploration was like."""
-    figures.figure_4(files.figure_4, _panels(rows, found, explored), explored)
+    figures.figure_4(files.figure_4, panels(rows, found, explored), explored)
     # Random actions are of no value to anyone, whatever a log says.
     at_random = {*UNPLANNED, *UNPLANNED.values()}
     planned = [r for r in rows if not at_random & {r.arm, r.data.get("planner")}]
@@ -184,7 +184,7 @@ def _curve(points: Points) -> Curve:
     return Curve(np.array(trials), np.array(values, float))
 
 
-def _panels(rows: Sequence[Row], found: Scores, explored: int) -> dict[str, TaskPanels]:
+def panels(rows: Sequence[Row], found: Scores, explored: int) -> dict[str, TaskPanels]:
     """Returns Figure 4 by task."""
     panels = {}
     for task in tables.tasks_of(rows):

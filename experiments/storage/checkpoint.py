@@ -27,7 +27,13 @@ from orbax.checkpoint import checkpoint_managers as policies
 
 import jaxpets
 
-from ..errors import CheckpointError, DivergedError, RunError, StorageError
+from ..errors import (
+    CheckpointError,
+    DivergedError,
+    RunError,
+    StorageError,
+    stop_behind,
+)
 from . import disk, pytrees, step_folders
 from .step_folders import broken, names, seal, steps
 
@@ -242,6 +248,8 @@ def _read(
     except (MemoryError, RunError, _DamagedError):  # a signal is none of its damage
         raise
     except Exception as error:
+        if stop := stop_behind(error):
+            raise stop from error
         raise _DamagedError(f"unreadable: {type(error).__name__}") from error
     for name, leaf in record["leaves"].items():
         if 0 in leaf["shape"]:

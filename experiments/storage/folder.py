@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from .. import errors
@@ -28,6 +27,7 @@ from . import (
 from .environment import environment, remember
 from .identity import Differences
 from .status import Writer
+from .trackers import Tracked
 
 
 class RunFolder(NamedTuple):
@@ -39,6 +39,7 @@ class RunFolder(NamedTuple):
     started: Mapping[str, Any] | None = None  # its config
     differences: Differences = lambda then, now, where: []
     status: Writer | None = None  # on process 0
+    tracked: Tracked | None = None  # likewise
 
     def say(self, text: str) -> None:
         """Prints lines for the user; the last one gets into status.json."""
@@ -128,6 +129,8 @@ class RunFolder(NamedTuple):
         def write() -> None:
             metrics.append_rows(self._log, rows)
             self._save(trial, state, {"rows": len(rows)}, finite)
+            if self.tracked is not None:
+                self.tracked.rows(trial, rows)
 
         distributed.on_first(write)
 
@@ -137,7 +140,18 @@ class RunFolder(NamedTuple):
 
     def log(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Writes the log of a phase that ends with it, all rows at once."""
-        distributed.on_first(lambda: metrics.replace_rows(self._log, rows))
+
+        def write() -> None:
+            metrics.replace_rows(self._log, rows)
+            if self.tracked is not None:
+                self.tracked.rows(rows[0]["explored_trials"], rows)
+
+        distributed.on_first(write)
+
+    def track_video(self, step: int, name: str, path: Path) -> None:
+        """Shows a video in the tracker, if there is one."""
+        if self.tracked is not None:
+            self.tracked.video(step, name, path)
 
     def save_trajectories(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes what a video is made of."""
@@ -209,7 +223,7 @@ class RunFolder(NamedTuple):
             return None
         number, meta, leaves = found
         like = template(leaves) if callable(template) else template
-        return number, _shared(kept[0] if kept else None, like), meta
+        return number, pytrees.shared(kept[0] if kept else None, like), meta
 
     def _foreign(self, meta: dict[str, Any]) -> str | None:
         return identity.foreign(self.path, meta, self.started, self.differences)
@@ -249,16 +263,17 @@ def open_run(
       StorageError: if it cannot be written to.
     """
     writer = Writer(path, config["phase"])
-    held = _held(path, config, differences, needed_bytes, writer)
+    tracked = Tracked(path, config)
+    held = _held(path, config, differences, needed_bytes, writer, tracked)
     with distributed.held_by_first(held):
-        own = writer if distributed.is_first() else None
-        yield RunFolder(path, tuple(config["milestones"]), config, differences, own)
+        own = (writer, tracked) if distributed.is_first() else (None, None)
+        yield RunFolder(path, tuple(config["milestones"]), config, differences, *own)
 
 
 @contextlib.contextmanager
 def _held(
     path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
-    writer: Writer,
+    writer: Writer, tracked: Tracked,
 ) -> Iterator[None]:  # fmt: skip
     with rundir.lock(path):
         disk.sweep(path)
@@ -266,7 +281,8 @@ def _held(
         _describe(path, config, differences)
         writer.begin()
         try:
-            yield
+            with contextlib.closing(tracked):
+                yield
         except BaseException as error:
             stopped = isinstance(error, KeyboardInterrupt)  # InterruptedRun is one
             with contextlib.suppress(StorageError):  # the first error says more
@@ -281,16 +297,3 @@ def _describe(path: Path, config: dict[str, Any], differences: Differences) -> N
     identity.settle(path, config, differences)
     for line in remember(path / rundir.ENVIRONMENT, environment()):
         distributed.say(f"warning: {line}")
-
-
-def _shared(state: Any, template: Any) -> Any:
-    """Gives every process the state that process 0 has read."""
-    if distributed.is_alone():
-        return state
-    arrays = {
-        name: np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"]))
-        for name, leaf in pytrees.describe(template).items()
-    }
-    if state is not None:
-        arrays = pytrees.to_host(state)
-    return pytrees.from_host(distributed.share(arrays), template)

@@ -15,6 +15,7 @@ A row is a trial of a seed, and of a task where one is sought:
     fit                      of the model after the trial, where there was one
     seconds                  act and fit
     constants, constants/... what was drawn for the trial, where anything is
+    check                    a checksum of the other entries, whatever their order
 
 Null is a number that is not finite. The log is JSON Lines. A run that is resumed cuts
 it back to the trials that its checkpoint knows of, so that each trial is in it once.
@@ -22,6 +23,7 @@ it back to the trials that its checkpoint knows of, so that each trial is in it 
 
 import json
 import os
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -116,7 +118,7 @@ def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
             if not line.endswith(b"\n"):
                 return
             try:
-                yield _parsed(json.loads(line), config, log.parent)
+                yield _parsed(_checked(line), config, log.parent)
             except (ValueError, RecursionError) as error:
                 why = f"{log}:{i} is no row of a run ({error})"
                 distributed.say(f"warning: {why}; left out.")
@@ -229,8 +231,23 @@ def _orphans(path: Path) -> Path:
 
 
 def _lines(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    lines = [json.dumps(rundir.plain(row), allow_nan=False) + "\n" for row in rows]
-    return "".join(lines).encode()
+    found = [rundir.plain(row) for row in rows]
+    found = [row | {"check": _check(row)} for row in found]
+    return "".join(json.dumps(row, allow_nan=False) + "\n" for row in found).encode()
+
+
+def _check(row: Mapping[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(row, sort_keys=True).encode()):08x}"
+
+
+def _checked(line: bytes) -> Any:
+    """Parses a line. A ValueError says why it is not what was written."""
+    data = json.loads(line)
+    if not isinstance(data, dict) or "check" not in data:  # of an older version
+        return data
+    if data.pop("check") != _check(data):
+        raise ValueError("it has changed: its check is of another one")
+    return data
 
 
 def _trials(path: Path) -> Iterator[tuple[bytes, int | None]]:
@@ -240,7 +257,7 @@ def _trials(path: Path) -> Iterator[tuple[bytes, int | None]]:
     with path.open("rb") as file:
         for line in file:
             try:
-                trial = json.loads(line)["trial"] if line.endswith(b"\n") else None
+                trial = _checked(line)["trial"] if line.endswith(b"\n") else None
             except (ValueError, KeyError, TypeError, RecursionError):
                 trial = None
             yield line, trial if type(trial) is int else None

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..parallel import distributed
+
 
 def describe(tree: Any) -> dict[str, dict[str, Any]]:
     """Returns `shape`, `dtype` and `key` of every leaf by path, as JSON values.
@@ -36,9 +38,8 @@ def differences(
         for what in ("key", "shape", "dtype"):
             was, now = stored[name][what], wanted[name][what]
             if was != now:
-                was, now = (
-                    tuple(x) if what == "shape" else x or "raw" for x in (was, now)
-                )
+                shown = tuple if what == "shape" else lambda x: x or "raw"
+                was, now = shown(was), shown(now)
                 lines.append(f"{name} has {what} {was} (checkpoint) vs {now} (now)")
                 break
     return lines
@@ -46,10 +47,8 @@ def differences(
 
 def to_host(tree: Any) -> dict[str, np.ndarray]:
     """Copies every leaf to the host, keys as their data."""
-    raw = {
-        name: jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        for name, leaf in _named_leaves(tree).items()
-    }
+    leaves = _named_leaves(tree)
+    raw = {n: jax.random.key_data(x) if _is_key(x) else x for n, x in leaves.items()}
     return {name: np.asarray(leaf) for name, leaf in jax.device_get(raw).items()}
 
 
@@ -102,3 +101,16 @@ def _key_impl(leaf: Any) -> str:
     found = []
     jax.eval_shape(lambda key: found.append(str(jax.random.key_impl(key))), leaf)
     return found[0]
+
+
+def shared(state: Any, template: Any) -> Any:
+    """Gives every process the state that process 0 has read."""
+    if distributed.is_alone():
+        return state
+    arrays = {
+        name: np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"]))
+        for name, leaf in describe(template).items()
+    }
+    if state is not None:
+        arrays = to_host(state)
+    return from_host(distributed.share(arrays), template)

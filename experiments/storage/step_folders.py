@@ -77,19 +77,16 @@ def broken(folder: Path) -> str | None:
     except ValueError as error:
         return str(error)
     lines = (folder / SEAL).read_text(errors="replace").splitlines()
-    sealed = {
-        name: checksum for checksum, _, name in (x.partition("  ") for x in lines)
-    }
+    split = (line.partition("  ") for line in lines)
+    sealed = {name: checksum for checksum, _, name in split}
     if not sealed:
         return f"{SEAL} is empty"
-    for name in sorted(sealed.keys() | found):
-        if name not in found or name not in sealed:
-            return (
-                f"{name} {'is missing' if name in sealed else 'does not belong there'}"
-            )
-        if found[name] != sealed[name]:
-            return f"checksum of {name}"
-    return None
+    if not (differ := found.items() ^ sealed.items()):
+        return None
+    name, _ = min(differ)
+    if name not in found:
+        return f"{name} is missing"
+    return f"checksum of {name}" if name in sealed else f"{name} does not belong there"
 
 
 def _checksums(folder: Path) -> dict[str, str]:

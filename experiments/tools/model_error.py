@@ -246,7 +246,7 @@ def _summary(values: np.ndarray) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and writes a JSON file; returns the exit code, as `experiments.run`."""
     parser = argparse.ArgumentParser(
-        prog="experiments.tools.model_error",
+        prog=f"{__package__}.model_error",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -26,7 +26,7 @@ from ..storage.folder import RunFolder
 
 
 def ship(run: Path, name: str, seed: int | None = None) -> Path:
-    """Writes the model of an exploration run to `results/pretrained/NAME`.
+    """Writes the model of an exploration run to `experiments/pretrained/NAME`.
 
     Args:
       run: folder of an exploration run that has performed.
@@ -98,7 +98,7 @@ def _rank(folder: RunFolder) -> tuple[int, bool, bool, str]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Ships a model; returns the exit code, as `experiments.run`."""
     parser = argparse.ArgumentParser(
-        prog="experiments.tools.pretrained", description=__doc__
+        prog=f"{__package__}.pretrained", description=__doc__
     )
     parser.add_argument("run", type=Path, help="folder of an exploration run")
     parser.add_argument("name", help="what --from pretrained/NAME will call it")

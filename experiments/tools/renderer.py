@@ -1,9 +1,16 @@
-"""What draws a robot, frame by frame, with MuJoCo and OpenGL."""
+"""What draws a robot, frame by frame, with MuJoCo and OpenGL.
 
+As a program it draws a ball, and so finds out whether it can.
+"""
+
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+
+NO_GL = 69  # exit code where OpenGL does not work; EX_UNAVAILABLE
+_BALL = "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
 
 
 class Look(NamedTuple):
@@ -77,3 +84,24 @@ def _floor_period(model: Any) -> float | None:
         return None
     period = 2.0 * floor.size[0] / model.mat(floor.matid[0]).texrepeat[0]
     return float(period) or None
+
+
+def main() -> int:
+    """Draws a ball; returns the exit code, NO_GL with a line where that fails."""
+    try:
+        import mujoco
+
+        model: Any = mujoco.MjModel.from_xml_string(_BALL)  # pyright: ignore
+        gl: Any = mujoco
+        renderer, data = gl.Renderer(model, 64, 64), gl.MjData(model)
+        gl.mj_forward(model, data)
+        renderer.update_scene(data)
+        drawn = bool(renderer.render().any())
+    except Exception as error:  # ImportError, RuntimeError, AttributeError, ...
+        drawn, *reasons = False, *str(error).splitlines(), type(error).__name__
+        print("error:", reasons[0], file=sys.stderr)
+    return 0 if drawn else NO_GL
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,7 +1,8 @@
 """`python -m experiments.tools.share RUN FILE`: a run's model as one file.
 
-What `jaxpets.load_model` reads, with the numbers that the run performs with. The files
-of `jaxpets.pretrained` were written by this, from `results/pretrained`.
+What `jaxpets.load_model` reads, with the numbers that the run performs with, and a card
+beside it. The files of `jaxpets.pretrained` were written by this, from
+`experiments/pretrained`.
 """
 
 import argparse
@@ -16,8 +17,9 @@ import jaxpets
 from .. import exploration
 from ..config import Config, PlannerConfig
 from ..errors import RunError
-from ..storage import rundir
+from ..storage import disk, rundir
 from ..storage.folder import RunFolder
+from . import card
 
 _ALL = ("horizon", "num_samples", "num_iterations")
 _SETTINGS = {
@@ -93,22 +95,24 @@ def _search(planner: PlannerConfig) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Shares a model; returns the exit code, as `experiments.run`."""
-    parser = argparse.ArgumentParser(
-        prog="experiments.tools.share", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog=f"{__package__}.share", description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an exploration run")
     parser.add_argument("file", type=Path, help="as model.safetensors")
     parser.add_argument("--seed", type=int, help="by default the run's first")
     parser.add_argument("--env", help="the robot of the run, if it is of a file")
     parser.add_argument("--licence", default="Apache-2.0", help="of the file")
+    words = "zero-shots with it, for its card; by default those in the run's folder"
+    parser.add_argument("--returns", type=Path, nargs="+", metavar="DIR", help=words)
     args = parser.parse_args(argv)
     options = {"env": args.env, "licence": args.licence}
     try:
         share(args.run, args.file, seed=args.seed, **options)
+        said = card.text(args.file, args.run, args.returns)
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
-    print(f"wrote {args.file}")
+    disk.write(page := args.file.with_suffix(".md"), said.encode())
+    print(f"wrote {args.file} and {page}")
     return 0
 
 

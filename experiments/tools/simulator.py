@@ -84,7 +84,7 @@ def perform(args: Arguments, robot: Robot) -> np.ndarray:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Performs, and prints a line per task; returns the exit code."""
-    args = tyro.cli(Arguments, args=argv, prog="experiments.tools.simulator")
+    args = tyro.cli(Arguments, args=argv, prog=f"{__package__}.simulator")
     try:
         robot = robots.named(args.env, args.engine)
     except RunError as error:

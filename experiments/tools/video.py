@@ -11,7 +11,6 @@ import argparse
 import logging
 import math
 import os
-import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -22,17 +21,12 @@ import numpy as np
 
 from ..errors import RunError, UsageError
 from ..storage import disk
-from .renderer import Draw, Look, open_renderer
+from . import opengl
+from .renderer import NO_GL, Draw, Look, open_renderer
 
 if TYPE_CHECKING:  # it brings mujoco, which may find no OpenGL
     from jaxpets.envs import Robot
 
-_NO_GL = 69  # exit code of the child where OpenGL does not work; EX_UNAVAILABLE
-_BACKENDS = ("egl", "osmesa")
-_GL_HINT = (
-    "on Debian or Ubuntu install libegl1 libopengl0 libgl1-mesa-dri"
-    " (or libosmesa6, with MUJOCO_GL=osmesa)"
-)
 _SIZE_RANGE = range(64, 4097)
 _FPS_RANGE = range(1, 121)
 
@@ -53,35 +47,11 @@ def render(
     Raises:
       RunError: if no OpenGL works here, or the child fails; one line says why.
     """
-    command = [sys.executable, "-m", f"{__package__}.video", str(npz), str(target)]
-    command += [f"--env={env}"] * (env is not None)
-    command += [f"--task={task}", f"--seed={seed}", f"--trial={trial}"]
-    command += ["--gif"] * gif
-    chosen = os.environ.get("MUJOCO_GL")
-    failures = []
-    for backend in (chosen,) if chosen else _BACKENDS:
-        variables = _child_env(backend)
-        child = subprocess.run(command, check=False, env=variables, capture_output=True)
-        if child.returncode == 0:
-            return
-        said = child.stderr.decode(errors="replace").strip().splitlines()
-        # Destructors may have a word after the error.
-        errors = [line for line in said if line.startswith("error: ")] or said
-        reason = errors[-1].removeprefix("error: ") if errors else "it said nothing"
-        if child.returncode < 0:  # a GL driver that crashes is as good as none
-            reason = f"ended by signal {-child.returncode}"
-        elif child.returncode != _NO_GL:
-            raise RunError(reason)
-        failures.append(f"{backend}: {reason}")
-    raise RunError(f"cannot render a video, {'; '.join(failures)}. {_GL_HINT}")
-
-
-def _child_env(backend: str) -> dict[str, str]:
-    """Returns the environment in which a child renders and leaves the GPU to JAX."""
-    here = Path(__file__).resolve().parents[2]
-    path = os.pathsep.join(filter(None, [str(here), os.environ.get("PYTHONPATH")]))
-    own = {"MUJOCO_GL": backend, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
-    return os.environ | own
+    words = [str(npz), str(target)]
+    words += [f"--env={env}"] * (env is not None)
+    words += [f"--task={task}", f"--seed={seed}", f"--trial={trial}"]
+    words += ["--gif"] * gif
+    opengl.in_child("video", words)
 
 
 def load_trial(npz: Path, *, task: str, seed: int, trial: int) -> np.ndarray:
@@ -170,7 +140,7 @@ def write_gif(target: Path, cut: list[np.ndarray], *, fps: float) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m experiments.tools.video",
+        prog=f"python -m {__package__}.video",
         description="Renders a recorded trial of a robot to mp4.",
     )
     parser.add_argument("npz", type=Path, help="trajectories.npz of a run")
@@ -267,7 +237,7 @@ def _opened(robot: "Robot", obs: np.ndarray, look: Look) -> tuple[Draw, np.ndarr
 def _no_gl(error: Exception) -> SystemExit:
     reason = str(error).splitlines() or [type(error).__name__]
     print("error:", reason[0], file=sys.stderr)
-    return SystemExit(_NO_GL)
+    return SystemExit(NO_GL)
 
 
 def _gif_steps(args: argparse.Namespace, num_steps: int) -> range:
@@ -284,7 +254,7 @@ def main() -> None:
     args = _parser().parse_args()
     # Read once, when JAX and MuJoCo are imported. Rendering needs no GPU of JAX's.
     os.environ["JAX_PLATFORMS"] = "cpu"
-    os.environ.setdefault("MUJOCO_GL", _BACKENDS[0])
+    os.environ.setdefault("MUJOCO_GL", opengl.BACKENDS[0])
     try:
         _render_here(args)
     except RunError as error:

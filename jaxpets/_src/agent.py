@@ -40,7 +40,7 @@ def agent(
 ) -> "Agent":
     """Builds an agent for any world: a Gymnasium environment, a loop, a machine.
 
-    Phase 1 of the paper (section 4), in a loop of the user's own:
+    Phase 1 of the paper (section 4), in a loop of the user's own::
 
       agent = jaxpets.agent(explorer, model, fitter, capacity=10_000,
           random_planner=jaxpets.random_planner(space.low, space.high))

@@ -36,8 +36,8 @@ class Ensemble(NamedTuple):
 
     Attributes:
       init: `(key) -> EnsembleParams`.
-      predict: `(params, obs [E, B, D], action [B, A]) -> (mean, variance)`, both
-        `[E, B, D]`, of the next observation.
+      predict: `(params, obs [E, B, D], action [B, A] or [E, B, A]) -> (mean,
+        variance)`, both `[E, B, D]`, of the next observation.
       sample: a DynamicsFn; draws from `predict` and bounds the result.
       fit_scaler: `(data: Transition [C, ...], size []) -> scaler` over the first rows,
         with the structure and shapes of the one of `init`.
@@ -169,8 +169,8 @@ def ensemble(
     ) -> tuple[Array, Array]:
         check_params(params)
         check_array("obs", obs, [config.num_members, "B", obs_size])
-        check_array("action", action, [obs.shape[1], action_size])
-        actions = jnp.broadcast_to(action, (config.num_members, *action.shape))
+        check_array("action", action, ["...", obs.shape[1], action_size])
+        actions = jnp.broadcast_to(action, (*obs.shape[:-1], action_size))
         inputs = encode_inputs(params.scaler, obs, actions)
         mean, raw = forward(params.network, inputs)
         low, high = params.network.min_logvar, params.network.max_logvar

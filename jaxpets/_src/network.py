@@ -1,4 +1,4 @@
-"""The network of one member: layers, activation, and how products are rounded."""
+"""Networks: a member of the ensemble, how its products are rounded, and a head."""
 
 import enum
 import functools
@@ -40,6 +40,24 @@ class Network(nn.Module):
             size, kernel_init=init, dot_general=product, name=f"layer_{index}"
         )
         return layer(x)
+
+
+class Head(nn.Module):
+    """An actor or a critic: two layers, normalised, and a linear output near zero.
+
+    Layer normalisation bounds what a critic says of actions that it has not seen (Ball
+    et al., 2023).
+    """
+
+    hidden_size: int
+    output_size: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for _ in range(2):
+            x = nn.elu(nn.LayerNorm()(nn.Dense(self.hidden_size)(x)))
+        small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
+        return nn.Dense(self.output_size, kernel_init=small)(x)
 
 
 def _swish(x: Array) -> Array:

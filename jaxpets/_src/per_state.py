@@ -43,15 +43,15 @@ def per_state(step_fn: Callable[[Any, Array, Array, Array], Array]) -> DynamicsF
         return next_obs
 
     rows = jax.vmap(move, (None, 0, 0, 0))
-    members = jax.vmap(rows, (None, 0, 0, None))
 
     def dynamics(params: Any, key: Array, obs: Array, action: Array) -> Array:
         check_key("key", key)
         check_array("obs", obs, ["E", "B", "D"])
-        check_array("action", action, [obs.shape[1], "A"])
+        check_array("action", action, ["...", obs.shape[1], "A"])
         # Drawn and not split: a draw of rows is what a key for some of them can share.
         data = jax.random.bits(key, (*obs.shape[:2], 2), jnp.uint32)
         keys = cast(Array, jax.random.wrap_key_data(data, impl="threefry2x32"))
-        return members(params, keys, obs, action)
+        of_member = None if action.ndim == 2 else 0
+        return jax.vmap(rows, (None, 0, 0, of_member))(params, keys, obs, action)
 
     return dynamics

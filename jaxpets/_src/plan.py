@@ -36,6 +36,7 @@ def plan(
     terminal_fn: Callable[[Any, Array], Array] | None = None,
     discount: float | Array = 1.0,
     risk_fn: Callable[[Array], Array] | None = None,
+    value_fn: Callable[[Any, Array], Array] | None = None,
 ) -> Planner:
     """Builds a model-predictive controller.
 
@@ -76,6 +77,10 @@ def plan(
         from 0, counts `discount^h`.
       risk_fn: `(returns [E, P]) -> []`, what a candidate is worth given the returns of
         its particles; None for their mean.
+      value_fn: `(PlanParams.reward, obs [E, P, D]) -> [E, P]`, or `[]` for all
+        particles, float32: what is still to be earned where the horizon ends, counted
+        `discount^H`. A reward that is further away than the horizon is found by it.
+        None: nothing.
 
     Returns:
       A Planner.
@@ -92,7 +97,7 @@ def plan(
     if chunk_size is not None:
         check_count("chunk_size", chunk_size)
 
-    returns = candidate_returns(reward_fn, terminal_fn, discount, risk_fn)
+    returns = candidate_returns(reward_fn, terminal_fn, discount, risk_fn, value_fn)
 
     def step(
         params: PlanParams, key: Array, state: Any, obs: Any

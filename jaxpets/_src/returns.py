@@ -41,19 +41,21 @@ def candidate_returns(
     terminal_fn: Callable[[Any, Array], Array] | None,
     discount: float | Array,
     risk_fn: Callable[[Array], Array] | None,
+    value_fn: Callable[[Any, Array], Array] | None = None,
 ) -> ReturnsFn:
     """Builds the values of candidates from their paths; see `plan` for the arguments.
 
-    Without an end, a discount and a risk the particles of a step are averaged at once,
-    and no reward of a particle is kept.
+    Without an end, a discount, a risk and a value the particles of a step are averaged
+    at once, and no reward of a particle is kept.
     """
     reward = checked_reward(reward_fn)
     check_scalar("discount", discount, 0.0, 1.0)
     undiscounted = not isinstance(discount, Array) and discount == 1
-    if terminal_fn is None and risk_fn is None and undiscounted:
+    if terminal_fn is None and risk_fn is None and value_fn is None and undiscounted:
         return _mean_returns(reward)
     if terminal_fn is not None:
         check_callable("terminal_fn", terminal_fn)
+    value = None if value_fn is None else _checked_value(value_fn)
     risk = jnp.mean if risk_fn is None else _checked_risk(risk_fn)
 
     def every(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
@@ -63,9 +65,12 @@ def candidate_returns(
 
     def returns(params: Any, path: Array, actions: Array) -> Array:
         rewards = _over_steps(every)(params, path[:-1], actions, path[1:])
+        if value is not None:
+            last = jax.vmap(value, (None, 1))(params, path[-1])
+            rewards = jnp.concatenate([rewards, last[None]])
         if terminal_fn is not None:
             alive = _alive(terminal_fn, params, path[1:])
-            rewards = jnp.where(alive, rewards, 0.0)
+            rewards = jnp.where(alive[: rewards.shape[0]], rewards, 0.0)
         steps = jnp.arange(rewards.shape[0], dtype=jnp.float32)
         weights = jnp.asarray(discount, jnp.float32) ** steps
         return jax.vmap(risk)(jnp.sum(weights[:, None, None, None] * rewards, axis=0))
@@ -94,7 +99,10 @@ def _mean_returns(reward_fn: RewardFn) -> ReturnsFn:
 def _alive(
     terminal_fn: Callable[[Any, Array], Array], params: Any, next_obs: Array
 ) -> Array:
-    """Tells `[H, N, E, P]` which steps earn: those before which nothing has ended."""
+    """Tells `[H+1, N, E, P]` which steps earn: those before which nothing has ended.
+
+    The last is what comes after the horizon.
+    """
 
     def ended(params: Any, obs: Array) -> Array:
         particles = obs.shape[:-1]
@@ -109,7 +117,25 @@ def _alive(
     ends = jax.vmap(jax.vmap(ended, (None, 1)), (None, 0))(params, next_obs)
     ends = jax.lax.cummax(ends.astype(jnp.int32)) > 0
     start = jnp.zeros((1, *ends.shape[1:]), bool)
-    return ~jnp.concatenate([start, ends[:-1]])
+    return ~jnp.concatenate([start, ends])
+
+
+def _checked_value(
+    value_fn: Callable[[Any, Array], Array],
+) -> Callable[[Any, Array], Array]:
+    check_callable("value_fn", value_fn)
+
+    def value(params: Any, obs: Array) -> Array:
+        particles = obs.shape[:-1]
+        result = jnp.asarray(value_fn(params, obs))
+        if result.dtype != jnp.float32 or result.shape not in ((), particles):
+            raise ValueError(
+                f"value_fn must return float32 of shape () or {particles}, got "
+                f"{result.dtype}{list(result.shape)}."
+            )
+        return jnp.broadcast_to(result, particles)
+
+    return value
 
 
 def _checked_risk(risk_fn: Callable[[Array], Array]) -> Callable[[Array], Array]:

@@ -118,7 +118,8 @@ class DynamicsFn(Protocol):
           params: anything the model needs.
           key: consumed.
           obs: `[E, B, D]`; row block e belongs to member e.
-          action: `[B, A]`, shared by the members.
+          action: `[B, A]`, shared by the members, as a search has them; from a policy,
+            which sees where each member has led, `[E, B, A]`.
 
         Returns:
           `[E, B, D]`, the next observations.

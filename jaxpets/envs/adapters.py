@@ -35,7 +35,7 @@ def from_brax(env: BraxEnv, *, keep: Sequence[str] = ()) -> Env:
 
     Its reward is of its own state, so what it earns and where it ends can be kept in
     one way only: as entries of the observation, which a model learns to predict. A
-    planner's reward then reads `next_obs` at "reward":
+    planner's reward then reads `next_obs` at "reward"::
 
       env = from_brax(brax_env, keep=("reward", "done"))
       place = coordinates.index(env.coordinates, "reward")

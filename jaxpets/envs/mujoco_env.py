@@ -45,7 +45,7 @@ def mujoco_env(
     """Builds an environment from a MuJoCo model.
 
     The coordinates of the model that is learned follow from the joints; they are in
-    `Env.coordinates`, and `jaxpets.coordinates.space` makes a ModelSpace of them:
+    `Env.coordinates`, and `jaxpets.coordinates.space` makes a ModelSpace of them::
 
       env = mujoco_env("hopper.xml")
       rows = env.coordinates

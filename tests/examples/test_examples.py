@@ -1,27 +1,12 @@
 """The examples run as printed, and show what they say they show."""
 
-import contextlib
-import io
 import re
-import runpy
-import sys
-from pathlib import Path
-from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
+import pages
 import pytest
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def run(name, *flags):
-    """Runs an example with flags; returns its names and the lines that it printed."""
-    printed = io.StringIO()
-    argv = mock.patch.object(sys, "argv", [name, *flags])
-    with argv, contextlib.redirect_stdout(printed):
-        names = runpy.run_path(str(EXAMPLES / name), run_name="__main__")
-    return names, printed.getvalue().splitlines()
+from pages import run
 
 
 def numbers(line):
@@ -92,7 +77,9 @@ def test_the_bonus_is_the_divergence_of_the_members(bonus, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_robot_of_ones_own_is_explored_and_told_to_do_two_things():
+def test_a_robot_of_ones_own_is_explored_and_told_to_do_two_things(
+    tmp_path, monkeypatch, capsys
+):
     names, lines = run("own_robot.py", "--tiny")
     assert len(lines) == 2 + 2
     assert all(np.isfinite(numbers(line)).all() for line in lines)
@@ -101,6 +88,11 @@ def test_a_robot_of_ones_own_is_explored_and_told_to_do_two_things():
     # It fell by no more than it is high, and no faster than it may.
     assert names["rows"][names["height"]].name == "qpos/z"
     assert -1.0 < numbers(lines[-1])[0] < 1.0
+    # What its guide has beside it: the table as printed, a task and a file.
+    monkeypatch.chdir(tmp_path)
+    pages.execute("docs/own_robot.md", names)
+    (shown,) = pages.blocks("docs/own_robot.md", "text")
+    assert capsys.readouterr().out.startswith(shown.removesuffix("  ...\n"))
 
 
 @pytest.mark.slow

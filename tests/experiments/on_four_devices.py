@@ -91,7 +91,7 @@ def one_plan():
 
 def report(out, one_seed):
     explored = ["--phase", "explore", "--preset", "smoke", "--engine", "mujoco"]
-    four = [*explored, "--seeds", "0", "1", "2", "3", "--out"]
+    four = [*explored, "--seeds", *map(str, runs.FOUR), "--out"]
     codes = [
         main([*four, str(out / "four")]),
         main(["--phase", "zero-shot", "--from", str(one_seed), *runs.REFIT]),

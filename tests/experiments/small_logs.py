@@ -2,6 +2,11 @@
 
 import json
 
+import pytest
+from matplotlib.figure import Figure
+
+from experiments.report import style
+from experiments.report.report import write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
 EXPLORED = 3
@@ -35,3 +40,12 @@ def explore_rows(arm, seeds):
         for trial in range(1, EXPLORED + 1)
         for seed in seeds
     ]
+
+
+def report_in(out):
+    """Reports with figures that are small and have no layout, which takes the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(style.STYLE, "savefig.dpi", 30)
+        patch.setattr(style, "Figure", lambda figsize, layout: Figure(figsize))
+        written = write_report(out, out / "report")
+    return written, (out / "report" / "report.md").read_text()

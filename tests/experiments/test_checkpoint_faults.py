@@ -334,9 +334,13 @@ def test_kill_during_a_save(tmp_path):
         assert (np.asarray(state["w"]) == step).all()
 
 
-def test_a_signal_while_reading_damages_nothing(directory, monkeypatch):
+@pytest.mark.parametrize("in_c", [False, True])
+def test_a_signal_while_reading_damages_nothing(directory, monkeypatch, in_c):
     def stopped(folder):
-        raise InterruptedRun("SIGTERM")
+        error = InterruptedRun("SIGTERM")
+        if in_c:  # which raises an error of its own
+            raise SystemError from error
+        raise error
 
     monkeypatch.setattr(checkpoint, "broken", stopped)
     with pytest.raises(InterruptedRun):

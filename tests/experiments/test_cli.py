@@ -329,6 +329,13 @@ def test_a_robot_brings_numbers_of_its_own_to_the_laptop():
     assert paper.num_trials == 60
 
 
+def of_c_code(met):
+    """Returns what C code raises that called Python and met an exception in it."""
+    error = SystemError("<function> returned a result with an exception set")
+    error.__cause__ = met
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
@@ -337,12 +344,13 @@ def test_a_robot_brings_numbers_of_its_own_to_the_laptop():
         (OSError(28, "No space left on device"), 5, "error: cannot go on (No space"),
         (OSError(30, "Read-only", "/x"), 5, "error: cannot use /x (Read-only). Check"),
         (InterruptedRun("SIGTERM"), 75, "stopped: SIGTERM; at most the trial under"),
+        (of_c_code(InterruptedRun("SIGTERM")), 75, "stopped: SIGTERM; at most the"),
     ],
 )
 def test_what_ends_a_run_is_a_line_and_its_status(
     out, capsys, monkeypatch, error, code, said
 ):
-    def explore(config, run):
+    def explore(config, run, watch):
         raise error
 
     monkeypatch.setattr(phases, "explore", explore)
@@ -355,7 +363,7 @@ def test_what_ends_a_run_is_a_line_and_its_status(
 
 
 def test_a_warning_is_one_line_without_its_source(out, capsys, monkeypatch):
-    def explore(config, run):
+    def explore(config, run, watch):
         warnings.warn("the kernel was built anew", stacklevel=1)
 
     monkeypatch.setattr(phases, "explore", explore)

@@ -1,7 +1,6 @@
 """State coverage: its bins, and its file beside a run."""
 
 import json
-import shutil
 
 import jax
 import numpy as np
@@ -104,15 +103,14 @@ def test_measures_are_shares_of_what_was_seen():
 
 
 @pytest.fixture(scope="module")
-def explored(tmp_path_factory):
-    return runs.explore(tmp_path_factory.mktemp("explored"), *SEEDS)
+def explored(explored_once):
+    return explored_once(*SEEDS).folder
 
 
 @pytest.fixture
 def again(explored, tmp_path):
     """A copy of that run."""
-    shutil.copytree(explored, tmp_path / runs.NAME)
-    return tmp_path / runs.NAME
+    return runs.copied(explored, tmp_path)
 
 
 def go_on(folder):

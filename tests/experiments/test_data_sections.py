@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from small_logs import explore_rows, write_run
+from small_logs import explore_rows, report_in, write_run
 
 from experiments.errors import UsageError
 from experiments.report.report import coverage, write_report
@@ -101,20 +101,21 @@ def test_report_has_a_table_and_a_figure(out):
 def test_report_without_coverage_has_no_such_section(out):
     for path in out.rglob("coverage.json"):
         path.unlink()
-    written = write_report(out, out / "report")
+    written, text = report_in(out)
     assert [path.name for path in written][-1] == "exploration.png"
     assert not (out / "report" / "coverage.png").exists()
-    assert "coverage" not in (out / "report" / "report.md").read_text()
+    assert "coverage" not in text
 
 
 def test_presets_have_their_own_coverage(out):
     add_run(out, "oracle", {0: of_cells(v3_w3=1)}, preset="paper")
     add_run(out, "random", {0: of_cells()}, name="none", preset="smoke")
     (out / "none" / "coverage.json").unlink()
-    names = [path.name for path in write_report(out, out / "report")]
+    written, text = report_in(out)
+    names = [path.name for path in written]
     pictures = [name for name in names if name.startswith("coverage")]
     assert pictures == ["coverage.png", "coverage-laptop.png"]
-    assert "| oracle | 1.0 (1 seed) |" in (out / "report" / "report.md").read_text()
+    assert "| oracle | 1.0 (1 seed) |" in text
 
 
 def test_arms_without_a_panel_beside_them(tmp_path):
@@ -187,8 +188,7 @@ def report_with(measured, **changes):
         **changes,
     }
     (measured / "model_error.json").write_text(json.dumps(data))
-    write_report(measured, measured / "report")
-    return (measured / "report" / "report.md").read_text()
+    return report_in(measured)[1]
 
 
 def test_report_has_a_table_of_each(measured):
@@ -207,8 +207,7 @@ def test_report_has_a_table_of_each(measured):
 def test_report_without_the_file_or_of_another_preset(measured):
     assert "Model error" not in report_with(measured, preset="paper")
     (measured / "model_error.json").unlink()
-    write_report(measured, measured / "report")
-    assert "Model error" not in (measured / "report" / "report.md").read_text()
+    assert "Model error" not in report_in(measured)[1]
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"preset": "laptop"}', "[]"])

@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 import math
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -16,7 +15,6 @@ import pytest
 import runs
 
 from experiments.parallel import devices
-from experiments.run import main
 from experiments.storage import checkpoint
 
 SCRIPT = Path(__file__).with_name("on_four_devices.py")
@@ -85,9 +83,10 @@ def test_one_device_is_left_as_it_is():
 
 
 class Runs(NamedTuple):
-    """What was run, on how many devices; seeds 0 to 3 unless there is one."""
+    """What was run, on how many devices; seeds 3 to 0 unless there is one."""
 
-    alone: Path  # seed 3, one device
+    alone: Path  # seed 0, one device
+    performed: Path  # that and all tasks, one device
     four: Path  # four devices
     four_then_one: Path  # the last trial on one device
     said: str  # by the process with four devices
@@ -96,9 +95,9 @@ class Runs(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def found(explored_copy, performed_once, tmp_path_factory):
     out = tmp_path_factory.mktemp("devices")
-    alone = runs.explore(out / "alone", 3)
+    alone = explored_copy(0)
     four = out / "four" / runs.NAME
     process = runs.start(SCRIPT, out, alone, devices=4)
     said, errors = process.communicate(timeout=300)
@@ -108,8 +107,9 @@ def found(tmp_path_factory):
     assert seen["devices"] == 4
     four_then_one = runs.unfinished(four, out / "four-one")
     with contextlib.redirect_stderr(io.StringIO()) as then:
-        assert runs.explore(four_then_one.parent, 0, 1, 2, 3) == four_then_one
-    return Runs(alone, four, four_then_one, errors, then.getvalue(), seen)
+        assert runs.explore(four_then_one.parent, *runs.FOUR) == four_then_one
+    said = errors, then.getvalue()
+    return Runs(alone, performed_once, four, four_then_one, *said, seen)
 
 
 def close(one, other, **tolerance):
@@ -119,7 +119,7 @@ def close(one, other, **tolerance):
 @pytest.mark.slow
 def test_a_seed_on_its_device_is_the_seed_alone(found):
     """In every trial; a CPU in four parts sums a little otherwise than a whole one."""
-    many = [row for row in runs.rows(found.four) if row["seed"] == 3]
+    many = [row for row in runs.rows(found.four) if row["seed"] == 0]
     assert len(many) == runs.LAST
     for row, alone in zip(many, runs.rows(found.alone), strict=True):
         close(row, alone, rel=1e-3, abs=1e-3)
@@ -137,7 +137,7 @@ def test_the_log_of_four_devices_is_in_order(found):
     assert [[row[name] for name in labels] for row in many] == [
         [row["trial"], seed, *(row[name] for name in labels[2:])]
         for row in alone
-        for seed in range(4)
+        for seed in runs.FOUR
     ]
 
 
@@ -148,7 +148,7 @@ def test_a_run_goes_on_with_another_number_of_devices(found):
     old = [row for row in runs.rows(found.four) if row["trial"] < runs.LAST]
     assert runs.rows(resumed)[: len(old)] == old
     new = runs.rows(resumed)[len(old) :]
-    assert [(row["seed"], row["trial"]) for row in new] == [(s, 3) for s in range(4)]
+    assert [(row["seed"], row["trial"]) for row in new] == [(s, 3) for s in runs.FOUR]
     assert checkpoint.steps(resumed / "checkpoints")[-1] == runs.LAST
     before, after = runs.learner(found.four, runs.LAST - 1), runs.learner(resumed)
     known = runs.STEPS * (runs.LAST - 1)
@@ -160,14 +160,10 @@ def test_a_run_goes_on_with_another_number_of_devices(found):
 
 
 @pytest.mark.slow
-def test_tasks_of_one_seed_are_spread(found, tmp_path):
+def test_tasks_of_one_seed_are_spread(found):
     """Restored from a run on one device and refit; the same returns as there."""
     assert found.seen["tasks"] == [1, 4, 1]
-    spread = found.alone / TASKS
-    shutil.copytree(found.alone, tmp_path / runs.NAME)
-    here = tmp_path / runs.NAME / TASKS
-    shutil.rmtree(here)
-    assert main(["--phase", "zero-shot", "--from", str(here.parent), *runs.REFIT]) == 0
+    spread, here = found.alone / TASKS, found.performed / TASKS
     for row, other in zip(runs.rows(spread), runs.rows(here), strict=True):
         assert row["task"] == other["task"]
         close(row, other, rel=1e-2, abs=1e-2)

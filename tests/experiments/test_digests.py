@@ -22,6 +22,7 @@ def test_digests_leave_out_the_time_and_old_names(tmp_path):
     found = []
     for name, seconds in (("loss", 1.0), ("nll", 2.0)):
         row = {"trial": 1, "fit": {name: 0.5}, "seconds": {"act": seconds}}
+        row["check"] = f"{seconds}"
         (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
         found.append(dict(digests.found_in(tmp_path)))
     assert found[0] == found[1]

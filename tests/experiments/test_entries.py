@@ -13,7 +13,8 @@ from experiments.errors import CheckpointError
 from experiments.presets import PRESETS, preset_config
 from experiments.storage.rundir import HALF_CHEETAH
 
-RESULTS = Path(__file__).parents[2] / "results"
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
 
 
 def file_with(name, value):
@@ -108,7 +109,10 @@ def test_what_a_stranger_may_write_is_a_name_or_a_path_or_refused(value):
 
 @pytest.mark.skipif(not RESULTS.exists(), reason="not in this copy of the code")
 def test_all_configs_that_were_ever_committed_can_be_read():
-    paths = sorted(RESULTS.rglob("*config.json"))
+    paths = [
+        *sorted(RESULTS.rglob("*config.json")),
+        *sorted((ROOT / "experiments").rglob("*config.json")),
+    ]
     assert len(paths) >= 4
     for path in paths:
         data = json.loads(path.read_text())
@@ -135,8 +139,8 @@ def test_what_a_run_is_does_not_depend_on_where_it_is_or_how_it_is_computed():
     may_change = {entry.name for entry in entries(Config)}
     may_change -= {entry.name for entry in entries(Run)}
     assert may_change == {
-        "out", "name", "video", "source", "at_trial", "chunk_length", "allow_cpu",
-        "debug", "coordinator_address", "num_processes", "process_id",
+        "out", "name", "track", "video", "source", "at_trial", "chunk_length",
+        "allow_cpu", "debug", "coordinator_address", "num_processes", "process_id",
     }  # fmt: skip
     config = PRESETS["smoke"]
     elsewhere = dataclasses.replace(config, name="x", chunk_length=1, allow_cpu=True)

@@ -43,19 +43,15 @@ def finish(process):
 
 
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory):
-    """A run without a stop: its folder, and what it said."""
-    out = tmp_path_factory.mktemp("straight")
-    code, errors = finish(start(*SMOKE, "--out", out))
-    assert code == 0, errors
-    return out / NAME, errors
+def straight(explored_once):
+    """A run without a stop."""
+    return explored_once(0)
 
 
 @pytest.fixture
 def again(straight, tmp_path):
     """A copy of that run."""
-    shutil.copytree(straight[0], tmp_path / NAME)
-    return tmp_path / NAME
+    return runs.copied(straight.folder, tmp_path)
 
 
 def untimed(folder):
@@ -88,21 +84,22 @@ def status(folder):
 
 @pytest.mark.slow
 def test_a_run_says_a_line_per_trial_and_nothing_else(straight):
-    folder, errors = straight
+    folder, output, errors = straight
+    assert output == ""
     lines = errors.splitlines()
     assert len(lines) == TRIAL + 1, errors
     for trial, line in enumerate(lines[:-1], 1):
         assert line.startswith(f"explore {trial}/{TRIAL}  value ")
         assert all(name in line for name in half_cheetah.TASK_NAMES)
         assert "steps/s" in line and "min left" in line
-    assert lines[-1].endswith(f"--phase zero-shot --from {folder}")
+    assert lines[-1].endswith(f"experiments.run zero-shot --from {folder}")
     assert status(folder) == "complete"
     assert json.loads((folder / "env.json").read_text())["backend"] == "cpu"
 
 
 @pytest.mark.slow
 def test_the_log_has_every_field(straight):
-    log = rows(straight[0])
+    log = rows(straight.folder)
     assert [row["trial"] for row in log] == [1, 2, 3]
     assert [row["planner"] for row in log] == ["random", "plan", "plan"]
     for row in log:
@@ -119,7 +116,7 @@ def test_the_log_has_every_field(straight):
 
 
 @pytest.mark.slow
-def test_interrupted_and_resumed_equals_uninterrupted(straight, tmp_path):
+def test_interrupted_and_resumed_equals_uninterrupted(straight, tmp_path, capsys):
     flags = (*SMOKE, "--out", tmp_path)
     process = start(*flags)
     assert process.stderr.readline().startswith("explore 1/3")
@@ -131,10 +128,9 @@ def test_interrupted_and_resumed_equals_uninterrupted(straight, tmp_path):
     folder = tmp_path / NAME
     assert status(folder) == "interrupted"
     assert checkpoint.steps(folder / "checkpoints") == [1]
-    code, errors = finish(start(*flags))
-    assert code == 0
-    assert errors.startswith("explore 2/3")
-    assert_same_run(folder, straight[0])
+    assert main([*map(str, flags)]) == 0
+    assert capsys.readouterr().err.startswith("explore 2/3")
+    assert_same_run(folder, straight.folder)
 
 
 @pytest.mark.slow
@@ -167,9 +163,9 @@ def test_a_run_may_be_given_more_trials(straight, again, capsys):
     longer = [*SMOKE, "--out", str(again.parent), "--num-trials", "4"]
     assert main(longer) == 0
     assert [row["trial"] for row in rows(again)] == [1, 2, 3, 4]
-    assert untimed(again)[:3] == untimed(straight[0])
+    assert untimed(again)[:3] == untimed(straight.folder)
     assert json.loads((again / "config.json").read_text())["num_trials"] == 4
-    old, new = learner(straight[0]).dataset, learner(again).dataset
+    old, new = learner(straight.folder).dataset, learner(again).dataset
     assert int(new.size) == new.data.obs.shape[1] == 4 * STEPS
     np.testing.assert_array_equal(new.data.obs[:, : 3 * STEPS], old.data.obs)
 
@@ -186,11 +182,11 @@ def test_a_run_may_be_given_more_trials(straight, again, capsys):
 
 
 @pytest.mark.slow
-def test_one_folder_takes_one_process(again):
+def test_one_folder_takes_one_process(again, capsys):
     before = contents(again)
-    with rundir.lock(again):
-        code, errors = finish(start(*SMOKE, "--out", again.parent))
-    assert code == 3
+    with rundir.lock(again):  # which is an open file's, not a process's
+        assert main([*SMOKE, "--out", str(again.parent)]) == 3
+    errors = capsys.readouterr().err
     assert f"{again} is in use by pid {os.getpid()}" in errors
     assert errors.count("\n") == 1
     assert contents(again) == before
@@ -216,11 +212,11 @@ def test_a_trial_without_checkpoint_is_refused(again, capsys):
 
 
 @pytest.mark.slow
-def test_two_seeds_through_all_phases(straight, tmp_path, capsys, monkeypatch):
-    seeds = ("--seeds", "0", "7")
-    assert main([*SMOKE, *seeds, "--out", str(tmp_path)]) == 0
-    folder = tmp_path / NAME
-    _check_side_by_side(folder, straight[0])
+def test_two_seeds_through_all_phases(
+    straight, explored_once, tmp_path, capsys, monkeypatch
+):
+    folder = runs.copied(explored_once(0, 7).folder, tmp_path)
+    _check_side_by_side(folder, straight.folder)
 
     # A video that cannot be made does not fail the run that it shows.
     monkeypatch.setenv("MUJOCO_GL", "crayons")

@@ -104,8 +104,13 @@ def test_trajectories_are_whole_or_made_again(tmp_path):
     [
         (lambda log: log.unlink(), [], "trials 1 to 3"),
         (lambda log: log.write_bytes(b""), [], "trials 1 to 3"),
-        (lambda log: os.truncate(log, 20), [1], "trials 2 to 3"),
+        (lambda log: os.truncate(log, 40), [1], "trials 2 to 3"),
         (lambda log: log.write_bytes(FLIPPED), [1, 3], "trial 2"),
+        (
+            lambda log: log.write_bytes(log.read_bytes().replace(b"1", b"2", 1)),
+            [2, 3],
+            "trial 1",
+        ),
     ],
 )
 def test_a_damaged_log_costs_rows_and_not_the_run(tmp_path, capsys, damage, left, lost):
@@ -130,7 +135,7 @@ def test_the_rows_of_a_trial_are_there_together(tmp_path, capsys):
     run = RunFolder(tmp_path)
     run.record(1, [{"trial": 1}, {"trial": 1}], state(1), finite=())
     log = tmp_path / rundir.METRICS
-    os.truncate(log, 13)
+    os.truncate(log, log.stat().st_size // 2)
     run.resume(state(0))
     assert "has lost rows of trial 1;" in capsys.readouterr().err
     # One of an older version does not, and remembers the size of the log.

@@ -30,9 +30,9 @@ SMALL = (
 
 
 @pytest.fixture(scope="module")
-def explored(tmp_path_factory):
+def explored(explored_copy):
     """A run that has performed after a refit, with the search of what is shipped."""
-    folder = runs.explore(tmp_path_factory.mktemp("explored"), 0)
+    folder = explored_copy(0)
     planner = PRESETS["laptop"].task_planner
     search = {
         "optimizer": planner.optimizer,

@@ -89,6 +89,39 @@ def test_a_log_of_an_older_version_has_todays_names(tmp_path):
     assert (first.arm, first.seed, first.trial, first.data) == ("count-32", 1, 2, new)
 
 
+def test_no_bit_of_a_log_changes_unnoticed(tmp_path, capsys):
+    """A row with one flipped bit is left out, or says what it said."""
+    log, label = tmp_path / "metrics.jsonl", {"arm": "best", "seed": 1, "trial": 2}
+    row_ = metrics.row({"phase": "explore"} | label, 2.5, 0.25, {"forward": -3.0})
+    metrics.append_rows(log, [row_])
+    whole, kept = log.read_bytes(), 0
+    for i in range(8 * len(whole)):
+        data = bytearray(whole)
+        data[i // 8] ^= 1 << i % 8
+        log.write_bytes(data)
+        found = [x.data for x in metrics.read(log, {"preset": "smoke"})]
+        assert found == [] or row_.items() <= found[0].items()
+        assert metrics.rows_by_trial(log) == ({2: 1} if found else {})
+        kept += len(found)
+    spaces = whole.count(b" ") + 1
+    assert kept < 8 * len("check") + spaces  # harmless: of that name, or a tab
+    assert "it has changed: its check is of another one" in capsys.readouterr().err
+
+
+def test_a_row_may_be_written_again_by_another_program(tmp_path):
+    log = tmp_path / "metrics.jsonl"
+    row_ = {"phase": "explore", "arm": "best", "seed": 1, "trial": 2, "value": 1e-5}
+    metrics.append_rows(log, [row_ | {"returns": {"b": 1e22, "a": -0.1}}])
+    data = json.loads(log.read_text())
+    log.write_text(json.dumps(data, sort_keys=True, separators=(",", ":")) + "\n")
+    (found,) = metrics.read(log, {"preset": "smoke"})
+    assert "check" in data and found.data.items() >= row_.items()
+    del data["check"]  # by whoever means to change a row
+    log.write_text(json.dumps(data | {"value": 2.0}) + "\n")
+    (found,) = metrics.read(log, {"preset": "smoke"})
+    assert found.data["value"] == 2.0
+
+
 def test_a_task_has_a_return_of_its_own():
     label = {"phase": "zero-shot", "task": "backward"}
     row_ = metrics.row(label, 2.0, 0.0, {"forward": 3.0, "backward": -3.0})

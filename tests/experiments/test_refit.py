@@ -26,8 +26,8 @@ TASK = "zero-shot-003-front-flip"
 
 
 @pytest.fixture(scope="module")
-def explored(tmp_path_factory):
-    return runs.explore(tmp_path_factory.mktemp("explored"), 0, 7)
+def explored(explored_copy):
+    return explored_copy(0, 7)
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
-from small_logs import EXPLORED, explore_rows, write_run
+from small_logs import EXPLORED, explore_rows, report_in, write_run
 
 from experiments.errors import CheckpointError, UsageError
-from experiments.report import logs, report, style, task_sections
+from experiments.report import logs, report, task_sections
 from experiments.report.report import load, write_report
 from jaxpets.envs.half_cheetah import TASK_NAMES
 
@@ -61,27 +60,32 @@ def write_arm(out, arm, scores, **config):
     return run
 
 
-@pytest.fixture
-def out(tmp_path):
+def write_out(out):
     for arm, scores in SCORES.items():
-        run = write_arm(tmp_path / "runs", arm, scores)
+        run = write_arm(out, arm, scores)
     write_run(
         run / f"finetune-{EXPLORED:03d}",
         finetune_rows("count", range(2)),
         phase="finetune",
         arm="count",
     )
-    return tmp_path / "runs"
+    return out
+
+
+@pytest.fixture
+def out(tmp_path):
+    return write_out(tmp_path / "runs")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """What is reported of `out`, before a test changes it."""
+    return report_of(write_out(tmp_path_factory.mktemp("plain") / "runs"))
 
 
 def report_of(out):
-    """Reports with figures that are small and have no layout, which takes the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(style.STYLE, "savefig.dpi", 30)
-        patch.setattr(style, "Figure", lambda figsize, layout: Figure(figsize))
-        write_report(out, out / "report")
-    table = json.loads((out / "report" / "table1.json").read_text())
-    return (out / "report" / "report.md").read_text(), table
+    _, text = report_in(out)
+    return text, json.loads((out / "report" / "table1.json").read_text())
 
 
 def edit_rows(log, change):
@@ -90,8 +94,8 @@ def edit_rows(log, change):
     log.write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
-def test_table_1_json_holds_the_scores_of_every_seed(out):
-    _, table = report_of(out)
+def test_table_1_json_holds_the_scores_of_every_seed(plain):
+    _, table = plain
     assert list(table) == ["epistemic", "count-16"]
     for arm, scores in SCORES.items():
         by_task = table["count-16" if arm == "count" else arm]
@@ -106,8 +110,8 @@ def test_table_1_json_holds_the_scores_of_every_seed(out):
             assert low < entry["mean"] < high
 
 
-def test_report_shows_means_spread_and_every_seed(out):
-    text, _ = report_of(out)
+def test_report_shows_means_spread_and_every_seed(plain):
+    text, _ = plain
     # 400, 500, 900: mean 600, standard deviation sqrt(70000).
     assert "| forward | 600 ± 265<br>[" in text
     assert "| count-16 | 2 | 150 | 160 | 170 | 180 |" in text
@@ -146,10 +150,10 @@ def test_noise_is_neither_a_plan_nor_a_random_trial(tmp_path, monkeypatch):
     assert "mean of 1 trials: forward -1.0" in text
 
 
-def test_a_variant_is_a_row_of_its_own(out):
+def test_a_variant_is_a_row_of_its_own(plain, out):
     scores = {"epistemic": [40.0, 50.0, 90.0]}
     rows = zero_shot_rows("epistemic", scores["epistemic"])
-    before, table = report_of(out)
+    before, table = plain
     folder = out / "laptop-epistemic" / "zero-shot-003-short"
     config = {"phase": "zero-shot", "arm": "epistemic", "tag": "short"}
     write_run(folder, rows, **config, task_planner={"horizon": 2})
@@ -169,8 +173,8 @@ def test_fine_tuning_of_a_variant_is_a_column_of_its_own(out):
     assert "| 4 | 1000 ± 0.7 (2 seeds) | 1001 ± 1.0 (3 seeds) |" in text
 
 
-def test_differences_of_means_are_of_our_arms_and_of_variants(out):
-    text, _ = report_of(out)
+def test_differences_of_means_are_of_our_arms_and_of_variants(plain):
+    text, _ = plain
     assert "| epistemic | count-16 | 450 [" in text  # 600 less 150
     assert "| count-16 | epistemic |" not in text
 
@@ -195,8 +199,8 @@ def test_a_run_that_is_called_all_counts(out):
     assert {row.seed for row in load(out) if row.arm == "epistemic"} == {0, 1, 2, 7}
 
 
-def test_report_says_what_is_missing(out):
-    text, _ = report_of(out)
+def test_report_says_what_is_missing(plain, out):
+    text, _ = plain
     assert "no log of random, oracle." in text
     assert "no fine-tuning after 3 trials of epistemic" in text
     log = out / "laptop-count" / "zero-shot-003" / "metrics.jsonl"
@@ -237,10 +241,9 @@ def test_one_seed_has_no_interval(tmp_path):
 def test_paper_numbers_stand_beside_the_preset_paper(tmp_path):
     write_arm(tmp_path, "epistemic", [1.0], preset="paper")
     write_arm(tmp_path, "epistemic", [2.0], preset="smoke")
-    written = write_report(tmp_path, tmp_path / "report")
+    written, text = report_in(tmp_path)
     names = {path.name for path in written}
     assert {"report.md", "table1.json", "report-smoke.md", "table1-smoke.json"} < names
-    text = (tmp_path / "report" / "report.md").read_text()
     assert "| front-flip | 21 (1 seed) | 5916 | 1561 | 129 | 2532 |" in text
     other = json.loads((tmp_path / "report" / "table1-smoke.json").read_text())
     assert other["epistemic"]["forward"]["mean"] == 2.0
@@ -271,8 +274,8 @@ def test_data_efficiency_is_a_table_of_its_own(out):
     assert table["epistemic"]["forward"]["mean"] == 600.0
 
 
-def test_the_ablation_is_a_table_of_means_over_seeds_and_trials(out):
-    assert "## Ablation" not in report_of(out)[0]
+def test_the_ablation_is_a_table_of_means_over_seeds_and_trials(plain, out):
+    assert "## Ablation" not in plain[0]
     returns = {
         task: [[10.0 * i, 20.0], [30.0, 40.0]] for i, task in enumerate(TASK_NAMES)
     }

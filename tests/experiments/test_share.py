@@ -12,7 +12,7 @@ import jaxpets
 from experiments import cli, exploration
 from experiments.build import build
 from experiments.storage.folder import RunFolder
-from experiments.tools import share
+from experiments.tools import card, share
 from jaxpets import models
 
 
@@ -31,6 +31,8 @@ def test_the_shipped_model_acts_as_its_run(tmp_path, monkeypatch):
     monkeypatch.setattr(exploration, "build", build_without_kernels)
     source, path = cli.PRETRAINED / "best", tmp_path / "best.safetensors"
     assert share.main([str(source), str(path)]) == 0
+    said = path.with_suffix(".md").read_text()
+    assert "60 trials of 1,000 steps" in said and "not performed a task yet" in said
     model, params = jaxpets.load_model(path)
     shipped, same = jaxpets.pretrained("best")
     jax.tree.map(np.testing.assert_array_equal, params, same)
@@ -69,3 +71,9 @@ def test_a_file_that_only_a_run_speaks_of_does_not_run(tmp_path, capsys):
     assert share.main([str(run), str(tmp_path / "m")]) == 2
     assert f"name it: --env {file}." in capsys.readouterr().err
     assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.skipif(not cli.PRETRAINED.exists(), reason="not in this copy of the code")
+@pytest.mark.parametrize("name", models.names())
+def test_a_card_that_comes_along_is_what_the_logs_say(name):
+    assert models.path(name).with_suffix(".md").read_text() == card.shipped(name)

@@ -15,7 +15,7 @@ import pytest
 
 from experiments import signals
 from experiments.errors import InterruptedRun
-from experiments.progress import Progress
+from experiments.progress import Progress, Watch
 
 ROOT = Path(__file__).parents[2]
 # A lock that is taken twice: as a program of XLA, it keeps Python from its handlers.
@@ -37,14 +37,27 @@ STUCK = """
 DEAF = """
     import os
     import signal
-    from experiments import cli, run
+    from experiments import cli, run, signals
     def parse(arguments):
         try:
             os.kill(os.getpid(), signal.SIGINT)
         except BaseException:
             pass
     cli.parse = parse
-    run.command()
+    signals.as_program(run.main)
+"""
+
+# XLA may still be at work on what the frames of a run that was stopped hold.
+HELD = """
+    from experiments import cli, errors, run, signals
+    class Buffer:
+        def __del__(self):
+            print("freed", flush=True)
+    def parse(arguments):
+        buffer = Buffer()
+        raise errors.InterruptedRun("SIGTERM")
+    cli.parse = parse
+    signals.as_program(run.main)
 """
 
 
@@ -78,6 +91,15 @@ def test_before_there_is_a_run_nothing_can_swallow_ctrl_c():
     assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGINT, "", "")
 
 
+def test_what_a_stopped_run_holds_is_not_freed():
+    argv = [sys.executable, "-c", textwrap.dedent(HELD), "explore"]
+    found = subprocess.run(
+        argv, check=False, cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert (found.returncode, found.stdout) == (75, "")
+    assert found.stderr.startswith("stopped: SIGTERM; ")
+
+
 def test_what_nohup_ignores_stays_ignored(hung_up):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with signals.stoppable():
@@ -98,7 +120,7 @@ def test_a_signal_that_meets_a_callback_of_asyncio_stops_the_run(caplog):
 
 def test_a_loop_stops_at_its_next_tick():
     done = []
-    progress = Progress(10, 0, "walk")
+    progress = Progress(10, 0, "walk", Watch())
     stopped = pytest.raises(InterruptedRun, match="SIGTERM")
     with stopped, signals.stoppable(), progress.interruptible():
         os.kill(os.getpid(), signal.SIGTERM)
@@ -116,7 +138,7 @@ def test_a_tick_that_does_not_come_is_not_waited_for(monkeypatch, capsys):
         told.append(reason)
         raise OSError("the disk is full")  # which keeps nobody
 
-    with signals.stoppable() as late, Progress(10, 0, "walk").interruptible():
+    with signals.stoppable() as late, Progress(10, 0, "walk", Watch()).interruptible():
         late.seconds, late.tell = 0.1, tell
         os.kill(os.getpid(), signal.SIGTERM)
         assert left.wait(20)

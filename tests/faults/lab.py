@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -37,6 +36,11 @@ PHASES = {
     "finetune": ["--phase", "finetune", *RUN, "--task", "forward",
                  "--refit.num-epochs", "1"],
 }  # fmt: skip
+REFIT = "refit"  # of minutes, to be stopped
+COMMANDS = PHASES | {
+    REFIT: ["--phase", "zero-shot", *RUN, "--refit.num-epochs", "10000",
+            "--refit.batch-size", "1"],
+}  # fmt: skip
 
 
 class Fault(NamedTuple):
@@ -45,7 +49,7 @@ class Fault(NamedTuple):
     kind: str  # row of the table
     phase: str
     what: int = COUNT
-    at: int = 0
+    at: int = 0  # which operation meets it; else its number among those of its kind
     number: int = 0
     signal: int | None = None
     after: float = 0.0
@@ -101,7 +105,7 @@ class Bench:
         (before / "out").mkdir(parents=True)
         for phase in self._phases:
             self.before[phase] = before
-            folder, writes, every, seconds = self._counted(phase)
+            folder, writes, every, seconds = self.counted(phase, phase)
             self.operations[phase], self.seconds[phase] = (writes, every), seconds
             self.wanted[phase] = contents(folder / "out")
             if phase == "explore":
@@ -111,9 +115,9 @@ class Bench:
             else:
                 before = folder if phase == "resume" else before
 
-    def _counted(self, phase: str) -> tuple[Path, int, int, float]:
+    def counted(self, phase: str, name: str) -> tuple[Path, int, int, float]:
         """Runs a phase; where, its writes, all its operations, and seconds."""
-        folder = self._folder / phase
+        folder = self._folder / name
         ignored = shutil.ignore_patterns("list")
         shutil.copytree(self.before[phase], folder, ignore=ignored)
         found = self.start(folder, Fault("none", phase, number=errno.EIO))
@@ -136,19 +140,26 @@ class Bench:
         finally:
             self._servers.put(server)
 
-    def meet_all(self, faults: Sequence[Fault], end: float) -> Iterator[Outcome]:
-        def meet(i: int) -> Outcome | None:
-            return self.meet(faults[i], i) if time.monotonic() < end else None
+    def meet_all(
+        self, faults: Sequence[Fault], over: Callable[[], bool] = lambda: False
+    ) -> Iterator[Outcome]:
+        """Yields outcomes as they come; begins with none once it is over."""
+
+        def meet(fault: Fault) -> Outcome | None:
+            return None if over() else self.meet(fault)
 
         with concurrent.futures.ThreadPoolExecutor(self._jobs) as pool:
-            for outcome in pool.map(meet, range(len(faults))):
-                if outcome is not None:
-                    yield outcome
+            begun = [pool.submit(meet, fault) for fault in faults]
+            try:
+                for done in concurrent.futures.as_completed(begun):
+                    if (outcome := done.result()) is not None:
+                        yield outcome
+            finally:
+                pool.shutdown(cancel_futures=True)
 
-    def meet(self, fault: Fault, number: int) -> Outcome:
+    def meet(self, fault: Fault) -> Outcome:
         """Lets a run meet a fault, runs it again, and compares."""
-        folder = self._folder / f"try-{number}"
-        shutil.copytree(self.before[fault.phase], folder)
+        folder = self._copied(fault.phase)
         if fault.damage:
             fault.damage(folder / "out")
         first = self.start(folder, fault)
@@ -175,29 +186,34 @@ class Bench:
             # A damaged config cannot be guessed: it has to be refused, in one line.
             refused = again["code"] == 3 and again["said"].count("\n") == 1
             return "" if fault.damage and refused else "exit code"
-        return self._differs(fault.phase, folder)
+        # A log that was damaged has lost rows, and the run has said so.
+        lost = fault.damage is not None and "has lost rows of" in first["said"]
+        return self._differs(fault.phase, folder, ("metrics.jsonl",) if lost else ())
 
-    def _differs(self, phase: str, folder: Path) -> str:
-        same = contents(folder / "out") == self.wanted[phase]
+    def _differs(self, phase: str, folder: Path, but: tuple[str, ...] = ()) -> str:
+        found, wanted = contents(folder / "out"), self.wanted[phase]
+        names = [name for name in found | wanted if not name.endswith(but)]
+        same = all(found.get(name) == wanted.get(name) for name in names)
         return "" if same else "not equal"
 
-    def two_writers(self, times: int) -> Iterator[Outcome]:
+    def two_writers(self, fault: Fault) -> Outcome:
         """Starts the same command twice at once: one runs, the other is refused."""
-        fault = Fault("two writers", "explore")
-        for i in range(times):
-            folder = self._folder / f"two-{i}"
-            shutil.copytree(self.before["explore"], folder)
-            with concurrent.futures.ThreadPoolExecutor(2) as pool:
-                found = list(pool.map(lambda _: self.start(folder, fault), range(2)))  # noqa: B023
-            codes = Counter(x["code"] for x in found)
-            if codes in (Counter({0: 2}), Counter({0: 1, 3: 1})):
-                wrong = self._differs("explore", folder)
-            else:
-                wrong = "hang" if None in codes else "exit code"
-            said = "".join(x["said"] for x in found)
-            code = found[-1]["code"]
-            yield Outcome(fault, True, wrong, code, said)
-            shutil.rmtree(folder)
+        folder = self._copied(fault.phase)
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(self.start, [folder] * 2, [fault] * 2))
+        codes = Counter(x["code"] for x in found)
+        if codes in (Counter({0: 2}), Counter({0: 1, 3: 1})):
+            wrong = self._differs(fault.phase, folder)
+        else:
+            wrong = "hang" if None in codes else "exit code"
+        shutil.rmtree(folder)
+        said = "".join(x["said"] for x in found)
+        return Outcome(fault, True, wrong, found[-1]["code"], said)
+
+    def _copied(self, phase: str) -> Path:
+        """Returns a new folder with what there is before a phase."""
+        folder = Path(tempfile.mkdtemp(prefix="try-", dir=self._folder))
+        return shutil.copytree(self.before[phase], folder, dirs_exist_ok=True)
 
 
 class Server:
@@ -215,6 +231,9 @@ class Server:
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
             "MUJOCO_GL": "disable",
             "TF_CPP_MIN_LOG_LEVEL": "2",
+            # What cannot be cached is compiled each time, and soon: it runs once.
+            "XLA_FLAGS": "--xla_backend_optimization_level=0 "
+            + os.environ.get("XLA_FLAGS", ""),
         }
         self._process = subprocess.Popen(
             [sys.executable, str(HERE / "server.py")],
@@ -222,15 +241,16 @@ class Server:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            start_new_session=True,  # Ctrl-C is for the bench, which sees it through
         )
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == "ready\n"
 
     def run(self, folder: Path, fault: Fault) -> dict[str, Any]:
         """Runs a phase in a folder; what it said is added to the answer."""
-        said = Path(tempfile.mkstemp(dir=folder)[1])
+        said = Path(tempfile.mkdtemp(dir=folder)) / "said"
         request = {
-            "argv": [*PHASES[fault.phase], "--out", str(folder / "out")],
+            "argv": [*COMMANDS[fault.phase], "--out", str(folder / "out")],
             "out": str(said),
             "root": str(folder / "out"),
             "what": fault.what if fault.number else 0,

@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 def child(request: dict[str, Any]) -> NoReturn:
     """Runs one command, which ends the process."""
-    from experiments import run
+    from experiments import run, signals
 
     said = os.open(request["out"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(said, 2)
@@ -43,7 +43,7 @@ def child(request: dict[str, Any]) -> NoReturn:
             listed,
         )
     sys.argv[1:] = request["argv"]
-    run.command()
+    signals.as_program(run.main)
 
 
 def wait(process: int, request: dict[str, Any]) -> int | None:
@@ -71,6 +71,9 @@ def main() -> None:
     import experiments.run
     import experiments.storage.folder  # noqa: F401
 
+    # A run gets them also where the bench is under nohup, or a script's background.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     gc.freeze()
     answers = os.fdopen(os.dup(1), "w")
     print("ready", file=answers, flush=True)

@@ -116,7 +116,7 @@ class Case:
 
     @functools.cache  # noqa: B019
     def args(self):
-        """Params, a key, a start and actions; from NumPy, for nothing to compile."""
+        """Params, a key, a start and actions; of NumPy, for nothing to compile."""
         rng = np.random.default_rng(0)
 
         def drawn(shape):
@@ -133,8 +133,7 @@ class Case:
         params = type(params)(type(params.network)(members, lowest, highest), scaler)
         shape = (self.num_samples, self.horizon, self.action_size)
         actions = rng.uniform(-1, 1, shape).astype(np.float32)
-        args = params, drawn((1, self.obs_size))[0], actions
-        params, obs, actions = jax.tree.map(jnp.asarray, args)
+        obs = drawn((1, self.obs_size))[0]
         return params, jax.random.key(1), obs, actions
 
     def avals(self):
@@ -174,10 +173,17 @@ CASES = {
 }
 
 
+def put(array, index, value):
+    """A copy with other entries."""
+    array = np.array(array)
+    array[index] = value
+    return array
+
+
 def unbounded(params):
     """Parameters before there are data: the range of what is imagined is infinite."""
     scaler = params.scaler
-    free = scaler._replace(low=scaler.low - jnp.inf, high=scaler.high + jnp.inf)
+    free = scaler._replace(low=scaler.low - np.inf, high=scaler.high + np.inf)
     return params._replace(scaler=free)
 
 
@@ -256,7 +262,7 @@ def stacked(case, levels):
             args.append(jax.random.split(arg, shape) if shape else arg)
             continue
         factors = 1 - 0.1 * np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
-        args.append(jax.tree.map(functools.partial(jnp.multiply.outer, factors), arg))
+        args.append(jax.tree.map(functools.partial(np.multiply.outer, factors), arg))
     axes = [
         tuple(0 if letter in level else None for letter in LETTERS) for level in levels
     ]

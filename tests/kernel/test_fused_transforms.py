@@ -23,7 +23,7 @@ def test_vmap_equals_the_loop(engine, levels):
     mapped = engine.fused(SMALL)
     for in_axes in reversed(axes):
         mapped = jax.vmap(mapped, in_axes)
-    got = jax.jit(mapped)(*args)
+    got = np.asarray(jax.jit(mapped)(*args))
     shape = SIZES[: len(levels)]
     assert got.shape[: len(shape)] == shape
     for index in np.ndindex(shape):
@@ -38,11 +38,13 @@ def test_vmap_equals_the_loop(engine, levels):
 
 def test_vmap_over_parts_of_params_and_other_axes():
     params, key, obs, actions = SMALL.args()
-    networks = jax.tree.map(lambda x: jnp.stack([x, 0.5 * x], -1), params.network)
-    stack = jnp.stack([actions, -actions], 1)
+    half = np.float32(0.5)
+    networks = jax.tree.map(lambda x: np.stack([x, half * x], -1), params.network)
+    stack = np.stack([actions, -actions], 1)
     in_axes = (type(params)(-1, None), None, None, 1)
     mapped = jax.vmap(REFERENCE.fused(SMALL), in_axes, out_axes=2)
     got = jax.jit(mapped)(params._replace(network=networks), key, obs, stack)
+    got = np.asarray(got)
     for i in range(2):
         network = jax.tree.map(lambda x, i=i: x[..., i], networks)
         want = REFERENCE.run(SMALL)(
@@ -56,7 +58,7 @@ def test_a_fifth_vmap_is_refused(engine):
     mapped = engine.fused(SMALL)
     for _ in range(5):
         mapped = jax.vmap(mapped, (None, None, 0, None))
-    many = jnp.broadcast_to(obs, (1, 2, 1, 2, 1, *obs.shape))
+    many = np.broadcast_to(obs, (1, 2, 1, 2, 1, *obs.shape))
     with pytest.raises(jax.errors.JaxRuntimeError, match="vmap is nested too deeply"):
         jax.block_until_ready(jax.jit(mapped)(params, key, many, actions))
 
@@ -73,7 +75,7 @@ def test_scan_equals_the_loop(engine):
         return jax.lax.scan(body, obs, keys)[1]
 
     keys = jax.random.split(key, 3)
-    for path, step in zip(looped(params, obs, keys), keys, strict=True):
+    for path, step in zip(np.asarray(looped(params, obs, keys)), keys, strict=True):
         want = engine.run(SMALL)(params, step, obs, actions)
         np.testing.assert_array_equal(path, want)
         obs = path[0, -1, 0, 0]
@@ -89,7 +91,8 @@ def test_one_trace_for_all_values():
     fn = jax.jit(counted)
     params, key, obs, actions = SMALL.args()
     fn(params, key, obs, actions)
-    fn(jax.tree.map(lambda x: 0.5 * x, params), key, -obs, 0.5 * actions)
+    half = np.float32(0.5)
+    fn(jax.tree.map(lambda x: half * x, params), key, -obs, half * actions)
     assert len(traces) == 1
 
 
@@ -149,10 +152,10 @@ def test_a_plan_that_ends_has_the_values_of_the_scan():
 def test_plans_of_many_seeds_in_chunks():
     params, key, obs = start()
     keys = jax.random.split(key, 3)
-    starts = jnp.stack([obs, -obs, 0.5 * obs])
+    starts = np.stack([obs, -obs, np.float32(0.5) * obs])
     got = jax.jit(jax.vmap(planned(25), (None, 0, 0)))(params, keys, starts)
     for i in range(3):
-        one = jax.tree.map(lambda x, i=i: x[i], got)
+        one = jax.tree.map(lambda x, i=i: np.asarray(np.asarray(x)[i]), got)
         want = planned()(params, keys[i], starts[i])
         # The values are the same; their means may be added up in another order.
         toys.assert_trees_close(one, want, rtol=1e-5, atol=1e-5)

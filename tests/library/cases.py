@@ -1,4 +1,7 @@
-"""The members of every protocol, each with three sets of arguments."""
+"""The members of every protocol, each with three sets of arguments.
+
+Arguments are arrays of NumPy: to make them, nothing is compiled.
+"""
 
 import functools
 from collections.abc import Callable
@@ -6,20 +9,33 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import toys
 
 import jaxpets
-from jaxpets import PlanParams
+from jaxpets import PlanParams, policies
 from jaxpets.envs import env_rollout
 from jaxpets.envs import half_cheetah as hc
 
 MODEL = toys.small_ensemble()
 MODELS = jax.jit(jax.vmap(MODEL.init))(jax.random.split(jax.random.key(0), 3))
 ENV = toys.cart_env()
+reset = jax.jit(ENV.reset)
 RND = jaxpets.rewards.random_network_distillation(
     optax.adam(1e-3), obs_size=2, hidden_size=8, num_features=4
 )
+TASK = policies.actor_critic(
+    toys.cart,
+    toys.reach,
+    optax.adam(1e-3),
+    policies.ActorCriticConfig(hidden_size=8),
+    jaxpets.delta_space(),
+    obs_size=2,
+    action_low=ENV.action_low,
+    action_high=ENV.action_high,
+)
+new_network = jax.jit(RND.init)
 NOISY = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=4)
 LEARNED = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
 
@@ -43,16 +59,20 @@ def keys_of(*shape):
 
 
 def model(i):
-    return jax.tree.map(lambda x: x[i], MODELS)
+    return row_of(MODELS, i)
+
+
+def row_of(tree, i):
+    return jax.tree.map(lambda x: np.asarray(np.asarray(x)[i]), tree)
 
 
 def cart_obs(i):
-    return jnp.array([0.1 * i - 0.1, 0.2 - 0.3 * i])
+    return np.float32([0.1 * i - 0.1, 0.2 - 0.3 * i])
 
 
 def warm(init, i):
     """A state as an earlier call may have left it."""
-    return jax.tree.map(lambda x: x + jnp.float32(0.1 * i), init())
+    return jax.tree.map(lambda x: np.asarray(x) + np.float32(0.1 * i), init())
 
 
 def planner_case(name):
@@ -85,37 +105,39 @@ def optimizer_case(name):
 
 
 def actions(i):
-    return jnp.sin(jnp.arange(20.0) + i).reshape(5, 4, 1)
+    return np.sin(np.arange(20, dtype=np.float32) + np.float32(i)).reshape(5, 4, 1)
 
 
 def particles(i, size=2):
     count = 3 * 4 * size
-    return jnp.cos(jnp.arange(float(count)) * (i + 1)).reshape(3, 4, size)
+    angles = np.arange(count, dtype=np.float32) * np.float32(i + 1)
+    return np.cos(angles).reshape(3, 4, size)
 
 
 def step_of(i, size=2, action_size=1):
-    action = jnp.full((action_size,), 0.1 * i, jnp.float32)
+    action = np.full((action_size,), 0.1 * i, np.float32)
     return particles(i, size), action, particles(i + 3, size)
 
 
 def mixed(i):
     weight = jnp.float32(0.1 * i)
-    return jaxpets.rewards.MixtureData(jnp.float32(i), jnp.ones(2), weight)
+    return jaxpets.rewards.MixtureData(jnp.float32(i), np.ones(2, np.float32), weight)
 
 
 def dataset(i):
     rows = particles(i).reshape(12, 2)
-    data = jaxpets.Transition(rows, rows[:, :1], rows)
-    return jaxpets.datasets.append(jaxpets.datasets.init(16, 2, 1), data)
+    return toys.dataset_of(jaxpets.Transition(rows, rows[:, :1], rows), capacity=16)
 
 
-def counts(i):
+@jax.jit
+def counted(dataset):
     projection = jaxpets.rewards.simhash(jax.random.key(5), 8, 2)
-    return jaxpets.rewards.count_states(projection, dataset(i))
+    return jaxpets.rewards.count_states(projection, dataset)
 
 
-def visited(i):
-    return jaxpets.rewards.visited_states(dataset(i), 8)
+@jax.jit
+def visited(dataset):
+    return jaxpets.rewards.visited_states(dataset, 8)
 
 
 def coloured_case():
@@ -131,6 +153,19 @@ def coloured_case():
 def jittered(gain, key, obs, action):
     noise = jax.random.normal(key, obs.shape, jnp.float32)
     return toys.cart(gain, None, obs, action) + 0.01 * noise
+
+
+def guided(i):
+    params = PlanParams(jnp.float32(1.0), jnp.float32(i))
+    networks = TASK.init(params, key_of(i), dataset(i)).params
+    return policies.Guided(params.reward, networks)
+
+
+def policy_case():
+    def variant(i):
+        return PlanParams((), guided(i)), key_of(i), (), cart_obs(i)
+
+    return Case(TASK.policy.step, variant, (2, 1))
 
 
 CASES = {
@@ -149,16 +184,18 @@ CASES = {
         lambda i: (jnp.float32(1 + i), key_of(i), particles(i), actions(i)[0]),
     ),
     "env_rollout": lambda: Case(
-        env_rollout(ENV), lambda i: ((), key_of(i), ENV.reset(key_of(i)), actions(i))
+        env_rollout(ENV), lambda i: ((), key_of(i), reset(key_of(i)), actions(i))
     ),
     "epistemic": lambda: Case(
-        jaxpets.rewards.epistemic, lambda i: (jnp.full(2, i + 0.5), *step_of(i))
+        jaxpets.rewards.epistemic,
+        lambda i: (np.full(2, i + 0.5, np.float32), *step_of(i)),
     ),
     "information_gain": lambda: Case(
-        jaxpets.rewards.information_gain, lambda i: (jnp.full(2, i + 0.5), *step_of(i))
+        jaxpets.rewards.information_gain,
+        lambda i: (np.full(2, i + 0.5, np.float32), *step_of(i)),
     ),
     "pseudo_count": lambda: Case(
-        jaxpets.rewards.pseudo_count, lambda i: (counts(i), *step_of(i))
+        jaxpets.rewards.pseudo_count, lambda i: (counted(dataset(i)), *step_of(i))
     ),
     "one_step_disagreement": lambda: Case(
         jaxpets.rewards.one_step_disagreement(MODEL.predict),
@@ -170,8 +207,10 @@ CASES = {
     ),
     "task_reward": lambda: Case(
         hc.task_reward,
-        lambda i: (jax.tree.map(lambda x: x[i], hc.tasks()), *step_of(i, 18, 6)),
+        lambda i: (row_of(hc.tasks(), i), *step_of(i, 18, 6)),
     ),
+    "policy": policy_case,
+    "guided-reward": lambda: Case(TASK.reward_fn, lambda i: (guided(i), *step_of(i))),
     "user-reward": lambda: Case(toys.reach, lambda i: (jnp.float32(i), *step_of(i))),
     "ensemble_std": lambda: Case(
         jaxpets.rewards.ensemble_std, lambda i: ((), *step_of(i))
@@ -183,10 +222,11 @@ CASES = {
         jaxpets.rewards.jensen_renyi(MODEL.predict), lambda i: (model(i), *step_of(i))
     ),
     "particle_entropy": lambda: Case(
-        jaxpets.rewards.particle_entropy(3), lambda i: (visited(i), *step_of(i))
+        jaxpets.rewards.particle_entropy(3),
+        lambda i: (visited(dataset(i)), *step_of(i)),
     ),
     "random_network_distillation": lambda: Case(
-        RND.reward, lambda i: (RND.init(key_of(i)), *step_of(i))
+        RND.reward, lambda i: (new_network(key_of(i)), *step_of(i))
     ),
     "mixture": lambda: Case(
         jaxpets.rewards.mixture(toys.reach, jaxpets.rewards.epistemic),

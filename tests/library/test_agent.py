@@ -139,7 +139,9 @@ def test_a_file_that_is_no_agent_is_refused(make, trained, tmp_path):
     path = tmp_path / "m"
     agent = make(params=trained)
     jaxpets.save_model(
-        path, toys.small_ensemble(), toys.small_ensemble().init(jax.random.key(0))
+        path,
+        toys.small_ensemble(),
+        jax.jit(toys.small_ensemble().init)(jax.random.key(0)),
     )
     with pytest.raises(ValueError, match=r"no agent .* format must be 'jaxpets agent'"):
         agent.load(path)
@@ -282,19 +284,20 @@ def test_what_an_agent_may_not_be_made_of(make, parts):
     with pytest.raises(ValueError, match="num_envs must be at least 1"):
         make(num_envs=0)
     with pytest.raises(ValueError, match="params must"):
-        make(params=toys.small_ensemble(obs_size=3).init(jax.random.key(0)))
+        make(params=jax.jit(toys.small_ensemble(obs_size=3).init)(jax.random.key(0)))
     with pytest.raises(TypeError, match="planner must be a Planner"):
         make().perform((), 3)
 
 
 def test_only_counted_rows_are_appended():
     data = toys.transitions(4)
-    full = jaxpets.datasets.append(jaxpets.datasets.init(5, 2, 1), data)
+    append = jax.jit(jaxpets.datasets.append)
+    full = append(jaxpets.datasets.init(5, 2, 1), data)
     one, two = jnp.int32(1), jnp.int32(2)
-    step = jaxpets.datasets.append(full, data, two)  # wraps around the end
+    step = append(full, data, two)  # wraps around the end
     assert (int(step.size), int(step.cursor)) == (5, 1)
     np.testing.assert_array_equal(step.data.obs[jnp.array([4, 0])], data.obs[:2])
     np.testing.assert_array_equal(step.data.obs[1:4], full.data.obs[1:4])
-    small = jaxpets.datasets.append(jaxpets.datasets.init(5, 2, 1), data, one)
+    small = append(jaxpets.datasets.init(5, 2, 1), data, one)
     assert (int(small.size), int(small.cursor)) == (1, 1)
     assert not np.asarray(small.data.obs[1:]).any()

@@ -13,7 +13,7 @@ CLOSE = dict(rtol=1e-4, atol=1e-5)  # see test_transforms
 
 
 def at(tree, *index):
-    return jax.tree.map(lambda x: x[index], tree)
+    return jax.tree.map(lambda x: np.asarray(np.asarray(x)[index]), tree)
 
 
 PLANNER = jaxpets.plan(LEARNED, toys.reach, toys.optimizer("cem", horizon=3))

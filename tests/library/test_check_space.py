@@ -29,11 +29,12 @@ def test_the_spaces_of_the_library_pass_on_data_of_the_robot(space):
         after = env.step(state, action)
         return after, (state.obs, after.obs)
 
-    actions = jax.random.uniform(jax.random.key(1), (20, 6), jnp.float32, -1.0, 1.0)
-    start = env.reset(jax.random.key(0))
-    _, (obs, next_obs) = jax.jit(lambda *args: jax.lax.scan(step, *args))(
-        start, actions
-    )
+    @jax.jit
+    def trial(key):
+        actions = jax.random.uniform(key, (20, 6), jnp.float32, -1.0, 1.0)
+        return jax.lax.scan(step, env.reset(key), actions)[1]
+
+    obs, next_obs = trial(jax.random.key(0))
     jaxpets.check_space(space, obs, next_obs)
 
 

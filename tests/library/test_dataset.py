@@ -1,4 +1,5 @@
 import collections
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,20 +12,26 @@ from jaxpets import Transition
 from jaxpets._src.dataset import AXES, append_stable
 
 CAPACITY = 8
+# One program each, and not one for every operation of theirs.
+append = jax.jit(jaxpets.datasets.append)
+grow = jax.jit(jaxpets.datasets.grow, static_argnums=1)
+obs_variance = jax.jit(jaxpets.datasets.obs_variance)
+num_stable = jax.jit(jaxpets.datasets.num_stable)
 
 
 def numbered(first, length):
     """Rows that say when they came."""
-    count = jnp.arange(first, first + length, dtype=jnp.float32)[:, None]
-    return Transition(jnp.tile(count, (1, 2)), -count, jnp.tile(count + 0.5, (1, 2)))
+    count = np.arange(first, first + length, dtype=np.float32)[:, None]
+    rows = np.tile(count, (1, 2)), -count, np.tile(count + np.float32(0.5), (1, 2))
+    return Transition(*map(jnp.asarray, rows))
 
 
 def held(dataset):
     """The valid rows' numbers, sorted."""
-    size = int(dataset.size)
-    obs = np.asarray(dataset.data.obs[:size, 0])
-    np.testing.assert_array_equal(dataset.data.action[:size, 0], -obs)
-    np.testing.assert_array_equal(dataset.data.next_obs[:size, 1], obs + 0.5)
+    size, data = int(dataset.size), jax.tree.map(np.asarray, dataset.data)
+    obs = data.obs[:size, 0]
+    np.testing.assert_array_equal(data.action[:size, 0], -obs)
+    np.testing.assert_array_equal(data.next_obs[:size, 1], obs + 0.5)
     return sorted(obs.tolist())
 
 
@@ -52,7 +59,7 @@ def test_keeps_the_newest_rows(lengths):
     queue = collections.deque(maxlen=CAPACITY)
     first = 0
     for length in lengths:
-        dataset = jaxpets.datasets.append(dataset, numbered(first, length))
+        dataset = append(dataset, numbered(first, length))
         queue.extend(range(first, first + length))
         first += length
         assert int(dataset.size) == len(queue)
@@ -60,7 +67,7 @@ def test_keeps_the_newest_rows(lengths):
 
 
 def test_one_trace_while_it_grows():
-    append = jax.jit(jaxpets.datasets.append)
+    append = jax.jit(functools.partial(jaxpets.datasets.append))  # a cache of its own
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     want = toys.avals(dataset)
     for first in range(0, 20, 4):
@@ -86,7 +93,7 @@ def test_what_comes_after_physics_diverged_is_no_data():
             cases.append(rows._replace(**{name: bad}))
     many = jax.tree.map(lambda *x: np.stack(x), *cases)
     many = jax.tree.map(lambda x: np.stack([x, x[:, ::-1]]), many)
-    found = jaxpets.datasets.num_stable(many)
+    found = num_stable(many)
     assert found.dtype == jnp.int32
     assert found.tolist() == [[5] + [3] * 9, [5] + [1] * 9]
 
@@ -94,26 +101,25 @@ def test_what_comes_after_physics_diverged_is_no_data():
 def test_what_blew_up_to_there_is_no_data_either():
     path = np.float32([0, 1, 4, 6, 13, 80, 70, 150, np.inf])[:, None]
     rows = Transition(path[:-1], 0 * path[:-1], path[1:])
-    assert jaxpets.datasets.num_stable(rows) == 6  # 70 is not more than 80
+    assert num_stable(rows) == 6  # 70 is not more than 80
     for count in (2, 3, 5, 7):  # whatever has grown, if it did not diverge
         part = jax.tree.map(lambda x, count=count: x[:count], rows)
-        assert jaxpets.datasets.num_stable(part) == count
+        assert num_stable(part) == count
 
 
 def test_rows_that_are_there_take_the_places_of_those_that_are_lost():
     """So that the sizes of seeds are equal, wherever each of them diverged."""
-    append = jax.jit(jax.vmap(append_stable, (AXES, 0), AXES))
+    append_many = jax.jit(jax.vmap(append_stable, (AXES, 0), AXES))
     empty = jaxpets.datasets.init(CAPACITY, 2, 1)
-    data = jax.tree.map(lambda x: jnp.stack([x] * 4), empty.data)
+    data = jax.tree.map(lambda x: np.stack([x] * 4), empty.data)
     many = empty._replace(data=data)
     found = []
     for first in (0, 3, 6):
-        rows = jax.tree.map(lambda x: jnp.stack([x] * 4), numbered(first + 1, 3))
+        rows = jax.tree.map(lambda x: np.stack([x] * 4), numbered(first + 1, 3))
         for seed, bad in ((1, 4), (2, 0), (2, 4), (3, 7)):
             if first <= bad < first + 3:
-                at = rows.next_obs.at[seed, bad - first :, 1].set(jnp.nan)
-                rows = rows._replace(next_obs=at)
-        many = append(many, rows)
+                rows.next_obs[seed, bad - first :, 1] = np.nan
+        many = append_many(many, rows)
         found.append(held_in_order(many))
     assert found[0] == [[1, 2, 3], [1, 2, 3], [0, 0, 0], [1, 2, 3]]
     assert found[1][:3] == [[1, 2, 3, 4, 5, 6], [1, 2, 3, 4, 1, 3], [0, 0, 0, 4, 0, 0]]
@@ -127,18 +133,18 @@ def test_rows_that_are_there_take_the_places_of_those_that_are_lost():
 def test_growing_keeps_every_row_and_the_oldest_goes_first(count):
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     for first in range(count):
-        dataset = jaxpets.datasets.append(dataset, numbered(first, 1))
-    grown = jaxpets.datasets.grow(dataset, 12)
+        dataset = append(dataset, numbered(first, 1))
+    grown = grow(dataset, 12)
     assert grown.data.obs.shape == (12, 2) and grown.size == dataset.size
     rows = list(range(max(0, count - CAPACITY), count))
-    np.testing.assert_array_equal(grown.data.obs[: len(rows), 0], rows)
+    np.testing.assert_array_equal(np.asarray(grown.data.obs)[: len(rows), 0], rows)
     assert held(grown) == rows
     # It is a ring of the new capacity: filled to one past it, the oldest row is lost.
     room = 12 - len(rows)
-    full = jaxpets.datasets.append(grown, numbered(count, room))
+    full = append(grown, numbered(count, room))
     rows += range(count, count + room)
     assert held(full) == rows
-    assert held(jaxpets.datasets.append(full, numbered(count + room, 1))) == [
+    assert held(append(full, numbered(count + room, 1))) == [
         *rows[1:],
         count + room,
     ]
@@ -147,9 +153,7 @@ def test_growing_keeps_every_row_and_the_oldest_goes_first(count):
 
 
 def test_growing_to_the_same_capacity_keeps_the_rows():
-    dataset = jaxpets.datasets.append(
-        jaxpets.datasets.init(CAPACITY, 2, 1), numbered(0, 8)
-    )
+    dataset = append(jaxpets.datasets.init(CAPACITY, 2, 1), numbered(0, 8))
     toys.assert_trees_close(jaxpets.datasets.grow(dataset, CAPACITY), dataset, rtol=0)
 
 
@@ -193,14 +197,10 @@ def test_sizes_are_integers():
 
 def test_the_variance_is_that_of_the_rows_that_are_there():
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
-    np.testing.assert_array_equal(jaxpets.datasets.obs_variance(dataset), [1.0, 1.0])
-    dataset = jaxpets.datasets.append(dataset, numbered(3, 5))
+    np.testing.assert_array_equal(obs_variance(dataset), [1.0, 1.0])
+    dataset = append(dataset, numbered(3, 5))
     want = np.arange(3.0, 8.0).var()
-    np.testing.assert_allclose(
-        jaxpets.datasets.obs_variance(dataset), [want, want], rtol=1e-6
-    )
-    dataset = jaxpets.datasets.append(dataset, numbered(8, 7))  # the oldest go
+    np.testing.assert_allclose(obs_variance(dataset), [want, want], rtol=1e-6)
+    dataset = append(dataset, numbered(8, 7))  # the oldest go
     want = np.arange(7.0, 15.0).var()
-    np.testing.assert_allclose(
-        jaxpets.datasets.obs_variance(dataset), [want, want], rtol=1e-6
-    )
+    np.testing.assert_allclose(obs_variance(dataset), [want, want], rtol=1e-6)

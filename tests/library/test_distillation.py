@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import toys
 
 import jaxpets
 from jaxpets.rewards import random_network_distillation
@@ -12,13 +13,14 @@ SIZES = dict(obs_size=D, hidden_size=16, num_features=4)
 RND = random_network_distillation(
     optax.adam(1e-2), **SIZES, num_epochs=20, batch_size=8
 )
+REWARD = jax.jit(RND.reward)
 
 
 def dataset_of(rows, capacity=64):
-    rows = jnp.asarray(rows, jnp.float32)
-    empty = jaxpets.datasets.init(capacity, D, 1)
+    rows = np.asarray(rows, np.float32)
     data = jaxpets.Transition(rows, rows[:, :1], rows)
-    return jaxpets.datasets.append(empty, data) if len(rows) else empty
+    empty = jaxpets.datasets.init(capacity, D, 1)
+    return toys.dataset_of(data, capacity) if len(rows) else empty
 
 
 def some_rows(count, seed=0):
@@ -32,12 +34,12 @@ def refresh():
 
 @pytest.fixture(scope="module")
 def untrained():
-    return RND.init(jax.random.key(0))
+    return jax.jit(RND.init)(jax.random.key(0))
 
 
 def novelty(state, rows):
     rows = jnp.asarray(rows)
-    return np.asarray(RND.reward(state, rows, jnp.zeros(1), rows))
+    return np.asarray(REWARD(state, rows, jnp.zeros(1), rows))
 
 
 def outputs(layers, x):

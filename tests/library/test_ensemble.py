@@ -25,11 +25,14 @@ def params(model):
     params = jax.jit(model.init)(jax.random.key(0))
     leaves, tree = jax.tree.flatten(params.network)
     rng = np.random.default_rng(0)
-    moved = [x + jnp.asarray(0.3 * rng.normal(size=x.shape), x.dtype) for x in leaves]
+    moved = [
+        x + np.float32(0.3 * rng.normal(size=x.shape)) for x in map(np.asarray, leaves)
+    ]
+    moved = list(map(jnp.asarray, moved))
     network = jax.tree.unflatten(tree, moved)
     data = toys.transitions(50)
     return params._replace(
-        network=network, scaler=model.fit_scaler(data, jnp.int32(50))
+        network=network, scaler=jax.jit(model.fit_scaler)(data, jnp.int32(50))
     )
 
 
@@ -66,6 +69,16 @@ def test_predict_equals_the_reference(model, params):
         # float32 through three layers of 16.
         np.testing.assert_allclose(mean[e], obs[e] + want, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(variance[e], np.exp(logvar), rtol=1e-4)
+
+
+def test_a_member_may_have_actions_of_its_own(model, params):
+    obs, action = batch()
+    own = jnp.stack([action, -action, 2.0 * action])
+    mean, variance = model.predict(params, obs, own)
+    for i in range(3):
+        want = model.predict(params, obs, own[i])
+        np.testing.assert_allclose(mean[i], want[0][i], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(variance[i], want[1][i], rtol=1e-6)
 
 
 def test_loss_equals_the_reference(model, params):
@@ -215,7 +228,7 @@ def test_scaler_equals_the_reference_on_the_rows_in_use(model):
 
 def test_scaler_of_nothing_is_the_identity(model):
     empty = jaxpets.datasets.init(8, D, A)
-    scaler = model.fit_scaler(empty.data, empty.size)
+    scaler = jax.jit(model.fit_scaler)(empty.data, empty.size)
     untrained = jax.jit(model.init)(jax.random.key(0))
     toys.assert_trees_close(scaler, untrained.scaler, rtol=0)
 
@@ -283,7 +296,7 @@ def test_wrong_arguments_fail_when_traced(model, params):
     obs, action = batch()
     with pytest.raises(ValueError, match=r"obs must be float32\[3, B, 2\], got"):
         model.predict(params, obs[:2], action)
-    with pytest.raises(ValueError, match=r"action must be float32\[7, 1\], got"):
+    with pytest.raises(ValueError, match=r"action must be float32\[..., 7, 1\], got"):
         model.sample(params, jax.random.key(0), obs, action[:5])
 
 

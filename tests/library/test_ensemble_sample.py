@@ -16,7 +16,7 @@ def params():
     """A model that has seen data."""
     model = toys.small_ensemble()
     data = toys.transitions(50)
-    scaler = model.fit_scaler(data, jnp.int32(50))
+    scaler = jax.jit(model.fit_scaler)(data, jnp.int32(50))
     return jax.jit(model.init)(jax.random.key(0))._replace(scaler=scaler)
 
 
@@ -50,7 +50,7 @@ def unstable(state_margin):
     layer = params.network.members["params"]["layer_0"] | {"kernel": kernel}
     network = params.network._replace(members={"params": {"layer_0": layer}})
     data = toys.transitions(50)
-    scaler = model.fit_scaler(data, jnp.int32(50))
+    scaler = jax.jit(model.fit_scaler)(data, jnp.int32(50))
     identity = scaler._replace(mean=jnp.zeros(D + A), std=jnp.ones(D + A))
     return model, params._replace(network=network, scaler=identity)
 

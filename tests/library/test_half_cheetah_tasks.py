@@ -11,6 +11,8 @@ import reference
 import jaxpets
 from jaxpets.envs import half_cheetah as hc
 
+task_reward = jax.jit(hc.task_reward)
+
 # -- tasks ---------------------------------------------------------------------------
 
 
@@ -20,7 +22,7 @@ def test_task_reward_equals_the_reference_at_every_leading_shape(name, lead):
     rng = np.random.default_rng(0)
     obs, next_obs = rng.normal(size=(2, *lead, 18)).astype(np.float32)
     action = rng.uniform(-1, 1, (*lead, 6)).astype(np.float32)
-    got = hc.task_reward(hc.task(name), obs, jnp.asarray(action), jnp.asarray(next_obs))
+    got = task_reward(hc.task(name), obs, action, next_obs)
     assert got.shape == lead and got.dtype == jnp.float32
     want = reference.task_reward(name.replace("-", "_"), action, next_obs)
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)

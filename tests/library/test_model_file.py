@@ -29,7 +29,7 @@ def saved(model, params, tmp_path_factory):
 
 def mean_and_variance(model, params):
     obs = np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 2, 2)
-    return model.predict(params, obs, np.ones((2, 1), np.float32))
+    return jax.jit(model.predict)(params, obs, np.ones((2, 1), np.float32))
 
 
 def test_what_was_saved_predicts_the_same(model, params, saved):
@@ -47,7 +47,7 @@ def test_coordinates_are_saved_and_own_functions_are_not(tmp_path):
     path = tmp_path / "m"
     space = coordinates.space(ROWS)
     model = toys.small_ensemble(space=space)
-    params = model.init(jax.random.key(1))
+    params = jax.jit(model.init)(jax.random.key(1))
     jaxpets.save_model(path, model, params)
     again, found = jaxpets.load_model(path)
     assert again.space.coordinates == ROWS

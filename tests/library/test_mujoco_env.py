@@ -43,9 +43,10 @@ def rolled(env, key, num_steps=30):
         after = env.step(state, action)
         return after, jaxpets.Transition(state.obs, action, after.obs)
 
-    start = env.reset(key)
-    keys = jax.random.split(key, num_steps)
-    return jax.jit(lambda *args: jax.lax.scan(step, *args))(start, keys)
+    def trial(key):
+        return jax.lax.scan(step, env.reset(key), jax.random.split(key, num_steps))
+
+    return jax.jit(trial)(key)
 
 
 def test_the_cheetah_comes_out_of_its_model(key):
@@ -60,9 +61,10 @@ def test_the_cheetah_comes_out_of_its_model(key):
 def test_readings_are_those_of_mujoco_in_the_state_that_was_reached(free, key):
     model = mujoco.MjModel.from_xml_string(robots.FREE_XML)
     data = mujoco.MjData(model)
-    state, action = free.reset(key), jnp.full((1,), 0.7)
+    state, action = jax.jit(free.reset)(key), jnp.full((1,), 0.7)
+    step = jax.jit(free.step)
     for _ in range(40):  # until it stands on its foot
-        before, state = state, free.step(state, action)
+        before, state = state, step(state, action)
     data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
     data.qacc_warmstart[:] = state.physics.qacc_warmstart
     data.ctrl[:] = action
@@ -98,7 +100,7 @@ def test_one_step_on_mjx_is_that_of_c(key):
         mujoco_env(SLOW_CART, observe=observe, control_step=0.01, backend=backend)
         for backend in ("mujoco", "mjx")
     )
-    start, action = native.reset(key), jnp.full((1,), 0.5)
+    start, action = jax.jit(native.reset)(key), jnp.full((1,), 0.5)
     got, want = (jax.jit(env.step)(start, action) for env in (mjx, native))
     # Five substeps in float32, without contacts.
     np.testing.assert_allclose(got.obs, want.obs, rtol=1e-4, atol=1e-5)

@@ -105,7 +105,7 @@ def test_the_warm_start_goes_in_and_comes_out(states, actions):
 
 def test_reset_is_that_of_mjx(env, key):
     keys = jax.random.split(key, 5)
-    got, want = (jax.vmap(e.reset)(keys) for e in (env, hc.half_cheetah()))
+    got, want = (jax.jit(jax.vmap(e.reset))(keys) for e in (env, hc.half_cheetah()))
     assert_same(got, want)
     np.testing.assert_array_equal(env.action_low, -np.ones(6))
     np.testing.assert_array_equal(env.action_high, np.ones(6))
@@ -146,7 +146,7 @@ def test_what_is_not_finite_is_nan_and_stays_alone(env, states, actions, after):
 
 def test_a_reset_is_seen_however_long_a_step_is(model, states):
     """MuJoCo goes on from a state that it has reset, here for two seconds."""
-    step = jax.vmap(native.native_physics(model, num_substeps=200))
+    step = jax.jit(jax.vmap(native.native_physics(model, num_substeps=200)))
     qpos, qvel, warmstart, _ = first(2, states).physics
     fast = Physics(qpos, qvel.at[0, 2].set(1e9), warmstart)
     got = step(*fast, jnp.zeros((2, 6), jnp.float32))[0]
@@ -157,7 +157,7 @@ def test_actions_are_clipped_even_when_infinite(env, states):
     state = first(3, states)
     wild = jnp.array([jnp.inf, -jnp.inf, 3.0, -1e30, 1.0, 0.5], jnp.float32)
     tame = jnp.array([1.0, -1.0, 1.0, -1.0, 1.0, 0.5], jnp.float32)
-    step = jax.vmap(env.step, (0, None))
+    step = jax.jit(jax.vmap(env.step, (0, None)))
     assert_same(step(state, wild), step(state, tame))
 
 
@@ -247,11 +247,15 @@ def test_gradients_are_refused(env, states):
 
 
 @pytest.mark.parametrize("num_threads", [1, 2, 3, 16])
-@pytest.mark.parametrize("count", [1, 7, 37, STATES])
-def test_threads_change_nothing(num_threads, count, states, actions, after):
+def test_threads_change_nothing(num_threads, states, actions, after):
     env = hc.half_cheetah_native(num_threads=num_threads)
-    got = jax.vmap(env.step)(*first(count, (states, actions)))
-    assert_same(got.physics, first(count, after.physics))
+    counts = 1, 7, 37, STATES
+
+    def steps(*args):
+        return [jax.vmap(env.step)(*first(count, args)) for count in counts]
+
+    for count, got in zip(counts, jax.jit(steps)(states, actions), strict=True):
+        assert_same(got.physics, first(count, after.physics))
 
 
 def test_callers_in_threads_take_turns(env, states, actions, after):
@@ -313,7 +317,7 @@ jax.vmap(env.step)(state, actions[0])  # the program ends with its threads alive
 def test_devices_share_the_host_and_threads_go_with_the_environment(tmp_path):
     """In a process of its own, with two devices: sharded, freed, and gone at exit."""
     package = Path(jaxpets.__file__).parents[1]
-    flags = "--xla_force_host_platform_device_count=2"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     result = subprocess.run(
         [sys.executable, "-c", DEVICES],
         capture_output=True,

@@ -35,7 +35,7 @@ def affine(params, obs, action):
 def test_one_step_disagreement_equals_the_reference():
     weight, variance = some_members()
     obs = some_particles()
-    fn = one_step_disagreement(affine)
+    fn = jax.jit(one_step_disagreement(affine))
     got = fn((weight, variance), jnp.asarray(obs), jnp.ones(2), jnp.zeros((E, P, D)))
     assert got.shape == (E, P)
     means = np.float64(weight)[:, None, None] * np.float64(obs)[None] + 2.0
@@ -48,7 +48,7 @@ def test_one_step_disagreement_equals_the_reference():
 def test_members_that_agree_disagree_by_nothing(build):
     obs = some_particles()
     same = (jnp.ones((E, D)), jnp.ones((E, D)))
-    got = build(affine)(same, jnp.asarray(obs), jnp.ones(2), obs)
+    got = jax.jit(build(affine))(same, jnp.asarray(obs), jnp.ones(2), obs)
     np.testing.assert_allclose(got, 0.0, atol=1e-5)
 
 
@@ -83,7 +83,7 @@ def test_opax_equals_the_reference():
     """The sum of log(1 + epistemic / aleatoric), in float64."""
     weight, variance = some_members()
     obs = some_particles()
-    got = opax(affine)((weight, variance), jnp.asarray(obs), jnp.ones(2), obs)
+    got = jax.jit(opax(affine))((weight, variance), jnp.asarray(obs), jnp.ones(2), obs)
     assert got.shape == (E, P)
     means = np.float64(weight)[:, None, None] * np.float64(obs)[None] + 2.0
     ratio = means.var(0) / np.float64(variance).mean(0)
@@ -95,7 +95,7 @@ def test_jensen_renyi_equals_the_reference():
     weight, variance = (np.float64(x) for x in some_members())
     obs = some_particles()
     params = tuple(jnp.float32(x) for x in (weight, variance))
-    got = jensen_renyi(affine)(params, jnp.asarray(obs), jnp.ones(2), obs)
+    got = jax.jit(jensen_renyi(affine))(params, jnp.asarray(obs), jnp.ones(2), obs)
     assert got.shape == (E, P)
     means = weight[:, None, None] * np.float64(obs)[None] + 2.0
 
@@ -113,10 +113,10 @@ def test_jensen_renyi_equals_the_reference():
 def test_jensen_renyi_of_members_that_share_nothing_is_log_of_their_number():
     """Also where their densities leave the range of float32."""
     size = 30
-    weight = 100.0 * jnp.arange(float(E))[:, None] * jnp.ones(size)
+    weight = np.float32(100 * np.arange(E)[:, None] * np.ones(size))
     obs = jnp.ones((E, 1, size))
     variance = jnp.full((E, size), 1e-6)
-    got = jensen_renyi(affine)((weight, variance), obs, jnp.ones(2), obs)
+    got = jax.jit(jensen_renyi(affine))((weight, variance), obs, jnp.ones(2), obs)
     # The sum of 30 logarithms of 1e-6 has a rounding of some 1e-5.
     np.testing.assert_allclose(got, np.log(E), rtol=1e-4)
 
@@ -131,6 +131,6 @@ def test_jensen_renyi_is_that_of_the_example():
     exec(compile(text[start:end], str(example), "exec"), names)
     step = (jnp.asarray(some_particles()), jnp.ones(2), jnp.zeros((E, P, D)))
     params = tuple(map(jnp.asarray, some_members()))
-    got = jensen_renyi(affine)(params, *step)
+    got = jax.jit(jensen_renyi(affine))(params, *step)
     want = names["jensen_renyi"](params, *step)
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)

@@ -1,5 +1,8 @@
 """Many seeds of a learner are the learners of the seeds."""
 
+import functools
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,21 +42,37 @@ def keys_of(*axes):
     return jnp.moveaxis(jax.random.split(jax.random.key(7), (*axes, 4)), -1, 0)
 
 
+class Programs(NamedTuple):
+    """A learner whose functions are compiled once; they take the state for good."""
+
+    init: object
+    step: object
+    learn: object
+
+
+@functools.cache
+def programs(*num_seeds):
+    """Of the learner over seeds, over seeds of seeds, or of one seed."""
+    learner = LEARNER
+    for number in reversed(num_seeds):
+        learner = jaxpets.over_seeds(learner, number)
+    step = functools.partial(learner.step, CHANCE)
+    taken = dict(donate_argnums=1)
+    return Programs(
+        jax.jit(learner.init), jax.jit(step, **taken), jax.jit(learner.learn, **taken)
+    )
+
+
 def run(learner, keys):
     """Two trials, and a third part of learning from transitions that were recorded."""
     axes = keys.shape[1:]
     state = learner.init(keys[0])
-    state, first = learner.step(CHANCE, keys[1], state)
-    state, second = learner.step(CHANCE, keys[2], state)
+    state, first = learner.step(keys[1], state)
+    state, second = learner.step(keys[2], state)
     rows = toys.transitions(LENGTH)
-    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (*axes, *x.shape)), rows)
+    rows = jax.tree.map(lambda x: np.broadcast_to(x, (*axes, *x.shape)), rows)
     state, metrics = learner.learn(keys[3], state, rows)
-    return state, (first, second, metrics)
-
-
-@pytest.fixture(scope="module")
-def run_one():
-    return jax.jit(lambda keys: run(LEARNER, keys))
+    return jax.tree.map(np.asarray, (state, (first, second, metrics)))
 
 
 def assert_seed_equals(many, index, one):
@@ -69,22 +88,19 @@ def assert_seed_equals(many, index, one):
     toys.assert_trees_close(got, want, **CLOSE)
 
 
-@pytest.mark.parametrize("num_seeds", [1, 3])
-def test_many_seeds_are_a_loop_over_the_seeds(run_one, num_seeds):
+def test_many_seeds_are_a_loop_over_the_seeds(num_seeds=3):
     keys = keys_of(num_seeds)
-    seeds = jaxpets.over_seeds(LEARNER, num_seeds)
-    got = jax.jit(lambda keys: run(seeds, keys))(keys)
+    got = run(programs(num_seeds), keys)
     for seed in range(num_seeds):
-        assert_seed_equals(got, seed, run_one(keys[:, seed]))
+        assert_seed_equals(got, seed, run(programs(), keys[:, seed]))
 
 
-def test_seeds_of_seeds_are_a_loop_over_both(run_one):
-    outer, inner = 1, 2
+def test_seeds_of_seeds_are_a_loop_over_both():
+    outer, inner = 2, 1  # within, a single seed
     keys = keys_of(outer, inner)
-    nested = jaxpets.over_seeds(jaxpets.over_seeds(LEARNER, inner), outer)
-    got = jax.jit(lambda keys: run(nested, keys))(keys)
+    got = run(programs(outer, inner), keys)
     for index in np.ndindex(outer, inner):
-        assert_seed_equals(got, index, run_one(keys[:, *index]))
+        assert_seed_equals(got, index, run(programs(), keys[:, *index]))
 
 
 def test_the_axes_of_a_state_are_the_public_ones():
@@ -134,19 +150,17 @@ def assert_every_leaf_is_a_buffer_of_its_own(tree):
     assert len({x.unsafe_buffer_pointer() for x in leaves}) == len(leaves)
 
 
-@pytest.mark.parametrize("num_seeds", [None, 2])
+@pytest.mark.parametrize("num_seeds", [None, 3])
 def test_a_state_made_outside_of_jit_can_be_donated(num_seeds):
     """Leaves that share a buffer fail: 'Attempt to donate the same buffer twice'."""
-    learner, keys = LEARNER, keys_of()
+    learner, keys, step = LEARNER, keys_of(), programs().step
     if num_seeds:
         learner, keys = jaxpets.over_seeds(LEARNER, num_seeds), keys_of(num_seeds)
+        step = programs(num_seeds).step
     state = learner.init(keys[0])
     assert_every_leaf_is_a_buffer_of_its_own(state)
-    step = jax.jit(
-        lambda key, state: learner.step(CHANCE, key, state), donate_argnums=1
-    )
     after, _ = step(keys[1], state)
-    assert after.dataset.size == LENGTH
+    assert after.dataset.size == LENGTH and state.dataset.size.is_deleted()
 
 
 def test_a_dataset_made_outside_of_jit_can_be_donated():

@@ -31,6 +31,13 @@ def test_every_particle_moves_as_it_would_alone(key):
     np.testing.assert_allclose(got, toys.cart(gain, key, OBS, ACTION), rtol=1e-6)
 
 
+def test_a_member_may_have_actions_of_its_own(key):
+    gain, model = jnp.float32(2.0), jaxpets.per_state(cart)
+    got = model(gain, key, OBS, jnp.stack([ACTION, -ACTION]))
+    for e, action in enumerate([ACTION, -ACTION]):
+        np.testing.assert_array_equal(got[e], model(gain, key, OBS, action)[e])
+
+
 def test_every_particle_has_noise_of_its_own(key):
     model = jaxpets.per_state(shaken)
     obs, action = jnp.zeros((2, 4000, 2)), jnp.zeros((4000, 1))
@@ -77,7 +84,7 @@ def test_a_batch_for_a_state_is_refused(key):
         model((), key, OBS, ACTION)
     with pytest.raises(ValueError, match=r"obs must be float32\[E, B, D\], got"):
         model((), key, OBS[0], ACTION)
-    with pytest.raises(ValueError, match=r"action must be float32\[3, A\], got"):
+    with pytest.raises(ValueError, match=r"action must be float32\[..., 3, A\], got"):
         model((), key, OBS, ACTION[:2])
     with pytest.raises(TypeError, match="step_fn must be a function, got 3"):
         jaxpets.per_state(3)

@@ -127,6 +127,45 @@ def test_a_risk_sees_members_and_their_particles():
     np.testing.assert_allclose(values_of(reach, chunk_size=4, **settings), got, **CLOSE)
 
 
+def ahead(params, obs):
+    """What is to come: more the further a particle is from params[0]."""
+    return (obs[..., 0] - params[0]) ** 2
+
+
+@pytest.mark.parametrize("reward_fn", [reach, spread])
+@pytest.mark.parametrize("discount", [1.0, 0.9])
+def test_what_is_to_come_counts_where_the_horizon_ends(reward_fn, discount):
+    want, _ = returns_by_hand(reward_fn, discount=discount)
+    _, path = rewards_by_hand(reward_fn)
+    want += discount**H * np.asarray(ahead(PARAMS.reward, path[:, -1]))
+    got = values_of(reward_fn, discount=discount, value_fn=ahead)
+    np.testing.assert_allclose(got, want.mean((1, 2)), **CLOSE)
+
+
+def test_nothing_is_to_come_behind_the_end():
+    _, path = rewards_by_hand(reach)
+    reached = np.abs(path[:, 1:, ..., 0]).max(1)
+    limit = float(np.median(reached))
+    want, _ = returns_by_hand(reach, limit=limit)
+    want += np.where(reached <= limit, ahead(PARAMS.reward, path[:, -1]), 0.0)
+    got = values_of(
+        reach,
+        terminal_fn=lambda params, obs: jnp.abs(obs[..., 0]) > limit,
+        value_fn=ahead,
+    )
+    np.testing.assert_allclose(got, want.mean((1, 2)), **CLOSE)
+
+
+def test_what_is_to_come_may_be_one_number_of_all_particles():
+    def at_worst(params, obs):
+        return jnp.min(ahead(params, obs))
+
+    _, path = rewards_by_hand(reach)
+    least = np.asarray(ahead(PARAMS.reward, path[:, -1])).min((1, 2))
+    got = values_of(reach, value_fn=at_worst)
+    np.testing.assert_allclose(got, values_of(reach) + least, **CLOSE)
+
+
 def test_a_discount_may_be_mapped():
     discounts = jnp.array([0.3, 1.0])
     got = jax.vmap(values_of_traced)(discounts)
@@ -165,6 +204,7 @@ def test_every_search_avoids_the_end(name):
         (dict(discount="1"), TypeError, "discount must be a Python float, got '1'"),
         (dict(terminal_fn=1.0), TypeError, "terminal_fn must be a function, got 1.0"),
         (dict(risk_fn="cvar"), TypeError, "risk_fn must be a function, got 'cvar'"),
+        (dict(value_fn=0.0), TypeError, "value_fn must be a function, got 0.0"),
     ],
 )
 def test_bad_settings_fail_when_built(settings, error, text):
@@ -186,6 +226,10 @@ def test_bad_settings_fail_when_built(settings, error, text):
         (
             dict(risk_fn=lambda returns: returns[0]),
             r"risk_fn's result must be float32\[\], got float32\[3\]",
+        ),
+        (
+            dict(value_fn=lambda params, obs: obs),
+            r"value_fn must return float32 of shape \(\) or \(2, 3\), got float32\[2",
         ),
     ],
 )

@@ -76,8 +76,9 @@ def test_no_key_is_used_twice():
     step = jax.shard_map(
         planner.step, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
     )
-    with jax.debug_key_reuse(True):
-        out, _ = jax.jit(step)(PARAMS, key_of(0), planner.init(), cart_obs(0))
+    args = PARAMS, key_of(0), planner.init(), cart_obs(0)
+    with jax.debug_key_reuse(True):  # which checks what is traced
+        out, _ = jax.jit(step).trace(*args).out_info
     assert out.actions.shape == (HORIZON, 1)
 
 

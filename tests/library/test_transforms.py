@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import toys
 from cases import CASES, KEYED, STATEFUL
@@ -31,11 +32,17 @@ def expected(name, i):
 
 def stacked(name):
     variants = [case_of(name).variant(i) for i in range(3)]
-    return jax.tree.map(lambda *x: jnp.stack(x), *variants)
+    return jax.tree.map(stack, *variants)
+
+
+def stack(*leaves):
+    """Of arrays or keys; the former without a program."""
+    is_key = jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key)
+    return (jnp if is_key else np).stack(leaves)
 
 
 def at(tree, *index):
-    return jax.tree.map(lambda x: x[index], tree)
+    return jax.tree.map(lambda x: np.asarray(np.asarray(x)[index]), tree)
 
 
 # Outside of jit each operation of an unrolled search is compiled by itself; those with
@@ -43,7 +50,8 @@ def at(tree, *index):
 @pytest.mark.parametrize("name", [x for x in CASES if x not in UNROLLED])
 def test_jit_equals_eager(name):
     case = case_of(name)
-    toys.assert_trees_close(case.fn(*case.variant(1)), expected(name, 1), **CLOSE)
+    args = jax.tree.map(jnp.asarray, case.variant(1))
+    toys.assert_trees_close(case.fn(*args), expected(name, 1), **CLOSE)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -51,7 +59,7 @@ def test_a_scan_of_vmap_equals_the_loop(name):
     def body(carry, args):
         return carry, jax.vmap(case_of(name).fn)(*args)
 
-    twice = jax.tree.map(lambda x: jnp.stack([x, x]), stacked(name))
+    twice = jax.tree.map(lambda x: stack(x, x), stacked(name))
     _, got = jax.jit(lambda xs: jax.lax.scan(body, 0, xs))(twice)
     for i in range(3):
         for turn in range(2):
@@ -97,7 +105,7 @@ def test_results_have_no_weak_types(name):
 def test_no_key_is_used_twice(name):
     case = case_of(name)
     with jax.debug_key_reuse(True):
-        jax.jit(functools.partial(case.fn))(*case.variant(0))
+        jax.jit(functools.partial(case.fn)).trace(*case.variant(0))  # as it checks then
 
 
 def test_the_checker_of_keys_works():
@@ -105,4 +113,4 @@ def test_the_checker_of_keys_works():
         return jax.random.normal(key) + jax.random.normal(key)
 
     with jax.debug_key_reuse(True), pytest.raises(jax.errors.KeyReuseError):
-        jax.jit(twice)(jax.random.key(0))
+        jax.jit(twice).trace(jax.random.key(0))

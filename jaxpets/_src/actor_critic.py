@@ -1,0 +1,208 @@
+"""An actor and a critic that learn a task in imagination, from states once seen."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from jaxpets._src.action_box import action_box
+from jaxpets._src.actor_critic_networks import build_networks
+from jaxpets._src.actor_critic_records import (
+    ActorCritic,
+    ActorCriticConfig,
+    ActorCriticMetrics,
+    ActorCriticState,
+    Goals,
+    Guided,
+)
+from jaxpets._src.actor_critic_update import build_update
+from jaxpets._src.checks import (
+    check_array,
+    check_callable,
+    check_count,
+    check_key,
+    check_record,
+)
+from jaxpets._src.fitter import Optimizer, check_optimizer
+from jaxpets._src.imagined_trials import imagine, single_reward
+from jaxpets._src.types import (
+    Dataset,
+    DynamicsFn,
+    ModelSpace,
+    PlanParams,
+    RewardFn,
+    Transition,
+)
+
+_NO_GOALS = Goals()
+
+
+def actor_critic(
+    dynamics_fn: DynamicsFn,
+    reward_fn: RewardFn,
+    optimizer: Optimizer,
+    config: ActorCriticConfig,
+    space: ModelSpace,
+    *,
+    obs_size: int,
+    action_low: ArrayLike,
+    action_high: ArrayLike,
+    num_members: int = 1,
+    goals: Goals = _NO_GOALS,
+    terminal_fn: Callable[[Any, Array], Array] | None = None,
+) -> ActorCritic:
+    """Builds what learns a task from a model alone: no step is taken in the world.
+
+    The paper plans no further than the horizon of its search. Where a reward is further
+    away no plan finds it, so here a critic learns what comes after the horizon, as in
+    POLO (Lowrey et al., 2018) and TD-MPC (Hansen et al., 2022), from trials that a
+    model explored without a reward imagines. They start in states of the data, keep
+    their member as TS-infinity does (section 3.2), and act by the actor, with noise.
+    Two critics learn its lambda-returns; the actor climbs the mean of the critics, as
+    in DDPG (Lillicrap et al., 2015).
+
+    A value is at most the largest reward seen or imagined so far, for ever, and at
+    least the smallest; returns beyond are clipped, so that no error feeds itself.
+
+    Nothing is jitted. Tasks and seeds are mapped: `step` over tasks with
+    `jax.vmap(step, (PlanParams(None, 0), 0, 0, None))`.
+
+    Args:
+      dynamics_fn: the model; reads `PlanParams.dynamics`, and gets actions `[E, B, A]`.
+      reward_fn: reads `PlanParams.reward`. It is asked about single states,
+        `[1, 1, D]`, so it cannot compare members.
+      optimizer: of optax, for both networks; `optax.adam` at a rate that falls to a
+        twentieth of 1e-3 over all gradient steps works well.
+      config: sizes and numbers.
+      space: what the networks see of an observation, `ModelSpace.features`.
+      obs_size: D.
+      action_low: `[A]`, finite.
+      action_high: `[A]`, above action_low.
+      num_members: E, of the model.
+      goals: what differs between trials.
+      terminal_fn: `(reward data, obs [..., D]) -> bool [...]`: where a trial ends.
+
+    Returns:
+      An ActorCritic. Its functions raise TypeError or ValueError, when traced, for
+      arguments of another kind or shape.
+
+    Raises:
+      TypeError, ValueError: if an argument is not what it should be.
+    """
+    check_callable("dynamics_fn", dynamics_fn)
+    check_optimizer(optimizer)
+    check_record("config", config, ActorCriticConfig)
+    check_record("space", space, ModelSpace)
+    check_record("goals", goals, Goals)
+    check_count("obs_size", obs_size)
+    check_count("num_members", num_members)
+    if terminal_fn is not None:
+        check_callable("terminal_fn", terminal_fn)
+    box = action_box(action_low, action_high)
+    networks = build_networks(config.hidden_size, space, goals, box)
+    learn = build_update(networks, optimizer, config, box)
+    rows = (num_members, -(-config.batch_size // num_members))
+    # Sizes are said, as a reward may have no data to see them by.
+    goals_of = jax.vmap(jax.vmap(goals.features, axis_size=rows[1]), axis_size=rows[0])
+
+    def explore(policy: Any, key: Array, rewards: Any, obs: Array) -> Array:
+        params, noise = policy
+        seen = networks.see(params, goals_of(rewards), obs)
+        action = jnp.tanh(networks.propose(params.actor, seen))
+        action += noise * jax.random.normal(key, action.shape, jnp.float32)
+        return box.center + box.half_width * jnp.clip(action, -1.0, 1.0)
+
+    run = imagine(dynamics_fn, reward_fn, terminal_fn, explore, config.horizon)
+
+    def starts(params: PlanParams, key: Array, dataset: Dataset) -> tuple[Array, Any]:
+        row_key, draw_key = jax.random.split(key)
+        chosen = jax.random.randint(row_key, rows, 0, jnp.maximum(dataset.size, 1))
+        draw = jax.vmap(jax.vmap(goals.draw, (None, 0)), (None, 0))
+        rewards = draw(params.reward, jax.random.split(draw_key, rows))
+        return dataset.data.obs[chosen], rewards
+
+    def init(params: PlanParams, key: Array, dataset: Dataset) -> ActorCriticState:
+        _check(params, key, dataset, obs_size)
+        start_key, draw_key, network_key = jax.random.split(key, 3)
+        obs, rewards = starts(params, start_key, dataset)
+        low, high = _reward_range(reward_fn, goals, params.reward, draw_key, dataset)
+        largest = jnp.maximum(high, -low)
+        scale = (1.0 - config.discount) / jnp.where(largest > 0.0, largest, 1.0)
+        goal = goals_of(rewards).reshape(rows[0] * rows[1], -1)
+        found = networks.init(network_key, goal, dataset)._replace(scale=scale)
+        opt_state = optimizer.init(cast(Any, (found.actor, found.critics)))
+        return ActorCriticState(
+            found, found.critics, opt_state, obs, rewards, low, high
+        )
+
+    def update(
+        params: PlanParams, dataset: Dataset, state: ActorCriticState, key: Array
+    ) -> tuple[ActorCriticState, ActorCriticMetrics]:
+        noise_key, run_key, learn_key, again_key, start_key = jax.random.split(key, 5)
+        noise = config.noise * jax.random.uniform(noise_key, (*rows, 1), jnp.float32)
+        policy = (state.params, noise)
+        steps = run(params.dynamics, policy, run_key, state.rewards, state.obs)
+        state = state._replace(
+            low=jnp.minimum(state.low, jnp.min(steps.reward)),
+            high=jnp.maximum(state.high, jnp.max(steps.reward)),
+        )
+        goal = goals_of(state.rewards)
+        state, value, skipped = learn(state, learn_key, goal, steps)
+        # Half of the trials are never far from the data; the others go on.
+        again = jax.random.uniform(again_key, rows, jnp.float32) < config.restart
+        again |= jnp.arange(rows[1]) < (rows[1] + 1) // 2
+        again |= ~(steps.counts[-1] & steps.goes_on[-1])
+
+        def renewed(new: Array, old: Array) -> Array:
+            return jnp.where(again.reshape(*rows, *(1,) * (old.ndim - 2)), new, old)
+
+        fresh = starts(params, start_key, dataset)
+        obs, rewards = jax.tree.map(renewed, fresh, (steps.next_obs[-1], state.rewards))
+        metrics = ActorCriticMetrics(value, jnp.mean(steps.reward), skipped)
+        return state._replace(obs=obs, rewards=rewards), metrics
+
+    def step(
+        params: PlanParams, key: Array, state: ActorCriticState, dataset: Dataset
+    ) -> tuple[ActorCriticState, ActorCriticMetrics]:
+        _check(params, key, dataset, obs_size)
+        check_record("state", state, ActorCriticState)
+        keys = jax.random.split(key, config.num_updates)
+        state, every = jax.lax.scan(
+            functools.partial(update, params, dataset), state, keys
+        )
+        num_skipped = jnp.sum(every.num_skipped, dtype=jnp.int32)
+        value, reward = jnp.mean(every.value), jnp.mean(every.reward)
+        return state, ActorCriticMetrics(value, reward, num_skipped)
+
+    def guided(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
+        check_record("params.reward", data, Guided)
+        return reward_fn(data.reward, obs, action, next_obs)
+
+    return ActorCritic(init, step, networks.policy, guided, networks.value_fn)
+
+
+def _check(params: Any, key: Any, dataset: Any, obs_size: int) -> None:
+    check_record("params", params, PlanParams)
+    check_key("key", key)
+    check_record("dataset", dataset, Dataset)
+    check_array("dataset.data.obs", dataset.data.obs, ["C", obs_size])
+
+
+def _reward_range(
+    reward_fn: RewardFn, goals: Goals, data: Any, key: Array, dataset: Dataset
+) -> tuple[Array, Array]:
+    """Returns the least and the largest reward of the data, 0 among them."""
+    one = single_reward(reward_fn)
+
+    def of_row(key: Array, row: Transition) -> Array:
+        return one(goals.draw(data, key), *row)
+
+    capacity = dataset.data.obs.shape[0]
+    rewards = jax.vmap(of_row)(jax.random.split(key, capacity), dataset.data)
+    used = (jnp.arange(capacity) < dataset.size) & jnp.isfinite(rewards)
+    rewards = jnp.where(used, rewards, 0.0)
+    return jnp.minimum(jnp.min(rewards), 0.0), jnp.maximum(jnp.max(rewards), 0.0)

@@ -1,0 +1,90 @@
+"""What an actor and its critics say of a state, as pure functions."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxpets._src.action_box import ActionBox
+from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
+from jaxpets._src.checks import check_record
+from jaxpets._src.moments import moments
+from jaxpets._src.network import Head
+from jaxpets._src.types import Dataset, ModelSpace, Planner, PlanOutput, PlanParams
+
+# Whitened inputs are cut off here: imagination may leave the data.
+_CLIP = 10.0
+
+
+class Networks(NamedTuple):
+    """Functions of ActorCriticParams; `seen` is `[..., F + G]`, whitened.
+
+    Attributes:
+      init: `(key, goal [R, G], Dataset) -> ActorCriticParams`, with scale 1.
+      see: `(params, goal [..., G], obs [..., D]) -> seen`.
+      propose: `(actor, seen) -> [..., A]`; its tanh is an action in half widths.
+      judge: `(critics, seen, action [..., A] in half widths) -> [2, ...]`, scaled.
+      policy: see ActorCritic.
+      value_fn: see ActorCritic.
+    """
+
+    init: Callable[[Array, Array, Dataset], ActorCriticParams]
+    see: Callable[[ActorCriticParams, Array, Array], Array]
+    propose: Callable[[Any, Array], Array]
+    judge: Callable[[Any, Array, Array], Array]
+    policy: Planner
+    value_fn: Callable[[Guided, Array], Array]
+
+
+def build_networks(
+    hidden_size: int, space: ModelSpace, goals: Goals, box: ActionBox
+) -> Networks:
+    """Builds the functions; see `actor_critic` for the arguments."""
+    actor = Head(hidden_size, box.center.shape[0])
+    critic = Head(hidden_size, 1)
+    propose = cast(Callable[[Any, Array], Array], actor.apply)
+    apply_critic = cast(Callable[[Any, Array], Array], critic.apply)
+    init_critic = cast(Callable[[Array, Array], Any], critic.init)
+
+    def init(key: Array, goal: Array, dataset: Dataset) -> ActorCriticParams:
+        actor_key, critic_key = jax.random.split(key)
+        of_obs = moments(space.features(dataset.data.obs), dataset.size)
+        of_goal = moments(goal, jnp.asarray(goal.shape[0]))
+        mean = jnp.concatenate([of_obs[0], of_goal[0]])
+        std = jnp.concatenate([of_obs[1], of_goal[1]])
+        both = jnp.concatenate([mean, box.center])
+        critics = jax.vmap(init_critic, (0, None))(jax.random.split(critic_key), both)
+        one = jnp.ones((), jnp.float32)
+        return ActorCriticParams(actor.init(actor_key, mean), critics, mean, std, one)
+
+    def see(params: ActorCriticParams, goal: Array, obs: Array) -> Array:
+        goal = jnp.broadcast_to(goal, (*obs.shape[:-1], goal.shape[-1]))
+        seen = jnp.concatenate([space.features(obs), goal], axis=-1)
+        return jnp.clip((seen - params.mean) / params.std, -_CLIP, _CLIP)
+
+    def judge(critics: Any, seen: Array, action: Array) -> Array:
+        inputs = jnp.concatenate([seen, action], axis=-1)
+        return jax.vmap(apply_critic, (0, None))(critics, inputs)[..., 0]
+
+    def decide(data: Guided, obs: Array) -> tuple[Array, Array]:
+        check_record("params.reward", data, Guided)
+        params = data.networks
+        seen = see(params, goals.features(data.reward), obs)
+        action = jnp.tanh(propose(params.actor, seen))
+        value = jnp.mean(judge(params.critics, seen, action), axis=0) / params.scale
+        return box.center + box.half_width * action, value
+
+    def step(
+        params: PlanParams, key: Array, state: tuple[()], obs: Array
+    ) -> tuple[PlanOutput, tuple[()]]:
+        del key
+        action, value = decide(params.reward, obs)
+        return PlanOutput(action, action[None], value), state
+
+    def value_fn(data: Guided, obs: Array) -> Array:
+        return decide(data, obs)[1]
+
+    policy = Planner(lambda: (), step)
+    return Networks(init, see, propose, judge, policy, value_fn)

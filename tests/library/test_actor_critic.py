@@ -1,0 +1,264 @@
+"""What an actor and a critic learn of tasks whose answers are known."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import toys
+
+import jaxpets
+from jaxpets import PlanParams
+from jaxpets._src.actor_critic_update import lambda_returns
+from jaxpets._src.imagined_trials import imagine
+from jaxpets.policies import (
+    ActorCriticConfig,
+    Goals,
+    Guided,
+    actor_critic,
+)
+
+NUM_UPDATES = 500
+DIVIDED = 6  # calls for a task that needs more
+
+
+class Task(NamedTuple):
+    """Data of one reward that is several."""
+
+    same: float = 0.0  # everywhere
+    near: float = 0.0  # within 0.1 of `place`
+    close: float = 0.0  # the closer to `place`
+    place: float = 0.0
+    spread: float = 0.0  # of places, between trials
+    end: float = float("inf")  # where trials end
+
+
+TASKS = {
+    "two": Task(same=2.0),
+    "minus one": Task(same=-1.0),
+    "nothing": Task(),
+    "short": Task(same=1.0, end=-9.0),
+    "far": Task(near=1.0, place=1.0),
+    "anywhere": Task(close=1.0, spread=1.0),
+    "broken world": Task(near=1.0, place=0.5),
+    "broken state": Task(same=1.0),
+}
+# What the cart gains by a force, and where the world blows up.
+WORLD = (jnp.float32(3.0), jnp.float32(jnp.inf))
+
+
+def dynamics(params, key, obs, action):
+    gain, limit = params
+    moved = toys.cart(gain, key, obs, action)
+    return jnp.where(obs[..., :1] > limit, jnp.inf, moved)
+
+
+def earn(task, obs, action, next_obs):
+    off = jnp.abs(next_obs[..., 0] - task.place)
+    within = task.near * (off < 0.1).astype(jnp.float32)
+    return task.same + within + task.close * jnp.exp(-4.0 * off**2)
+
+
+def draw(task, key):
+    shift = task.spread * jax.random.uniform(key, (), jnp.float32, -1.0, 1.0)
+    return task._replace(place=task.place + shift)
+
+
+def build(**changes):
+    numbers = dict(hidden_size=32, batch_size=16, horizon=3, num_updates=NUM_UPDATES)
+    numbers |= dict(discount=0.9, target_rate=0.1)
+    numbers |= {k: changes.pop(k) for k in list(changes) if k in NUMBERS}
+    settings = dict(
+        dynamics_fn=dynamics,
+        reward_fn=earn,
+        optimizer=optax.adam(2e-3),
+        config=ActorCriticConfig(**numbers),
+        space=jaxpets.delta_space(),
+        obs_size=2,
+        action_low=-toys.LIMIT,
+        action_high=toys.LIMIT,
+        goals=Goals(draw, lambda task: task.place[None]),
+        terminal_fn=lambda task, obs: obs[0] > task.end,
+    )
+    return actor_critic(**(settings | changes))
+
+
+NUMBERS = ActorCriticConfig.__dataclass_fields__
+
+
+def states(count=500, reach=1.5):
+    """States all over the place, as exploration leaves them."""
+    rng = np.random.default_rng(0)
+    rows = jnp.asarray(rng.uniform(-reach, reach, (count, 2)), jnp.float32)
+    data = jaxpets.Transition(rows, rows[:, :1], rows)
+    return jaxpets.datasets.append(jaxpets.datasets.init(count + 20, 2, 1), data)
+
+
+class Learned(NamedTuple):
+    """What was learned of one task."""
+
+    guided: Guided
+    before: Any  # a state
+    after: Any
+    metrics: Any
+
+    def value(self):
+        return LEARNER.value_fn(self.guided, states().data.obs[:50])
+
+
+LEARNER = build()
+INIT, STEP = jax.jit(LEARNER.init), jax.jit(LEARNER.step)
+
+
+@functools.cache
+def learn(name, num_calls=1):
+    """Every task is learned by the same compiled program."""
+    data, task = states(), Task(*map(jnp.float32, TASKS[name]))
+    limit = 1.0 if name == "broken world" else jnp.inf
+    params = PlanParams((WORLD[0], jnp.float32(limit)), task)
+    keys = jax.random.split(jax.random.key(0), num_calls + 1)
+    before = INIT(params, keys[0], data)
+    if name == "broken state":
+        bad = before.params._replace(scale=jnp.float32(jnp.nan))
+        before = before._replace(params=bad)
+    after = before
+    for key in keys[1:]:
+        after, metrics = STEP(params, key, after, data)
+    return Learned(Guided(task, after.params), before, after, metrics)
+
+
+def driven(planner, reward, start, length=40):
+    """Positions `[T]` of the cart."""
+    params = PlanParams(WORLD, reward)
+    env = toys.cart_env(float(WORLD[0]))
+    env = env._replace(reset=lambda key: jaxpets.EnvState(start, jnp.int32(0)))
+
+    def run(key):
+        state = jaxpets.start_trial(env, planner, key)
+        return jaxpets.unroll(env, planner, params, key, state, length=length)[1]
+
+    return np.asarray(jax.jit(run)(jax.random.key(1)).next_obs[:, 0])
+
+
+def test_returns_equal_the_recursion_by_hand():
+    rng = np.random.default_rng(1)
+    reward, after = rng.normal(size=(2, 4, 3)).astype(np.float32)
+    goes_on = rng.uniform(size=(4, 3)) < 0.7
+    got = lambda_returns(reward, after, goes_on, discount=0.9, trace=0.3)
+    later = after[-1]
+    for t in reversed(range(4)):
+        later = reward[t] + 0.9 * goes_on[t] * (0.7 * after[t] + 0.3 * later)
+        np.testing.assert_allclose(got[t], later, rtol=1e-5)
+
+
+def test_imagined_trials_end_and_stay():
+    """The second member blows up in its second step, the first ends at 0.5."""
+
+    def dynamics(params, key, obs, action):
+        bad = (obs[..., 1] > 0.15) & (jnp.arange(2)[:, None] == 1)
+        moved = obs + params * action
+        return jnp.where(bad[..., None], jnp.nan, moved)
+
+    run = imagine(
+        dynamics,
+        lambda data, obs, action, next_obs: data * next_obs[..., 0],
+        lambda data, obs: obs[0] > 0.5,
+        lambda policy, key, data, obs: jnp.full((2, 1, 2), policy),
+        4,
+    )
+    data = jnp.array([[1.0], [10.0]])
+    steps = run(jnp.float32(1.0), 0.2, jax.random.key(0), data, jnp.zeros((2, 1, 2)))
+    counts = np.asarray(steps.counts[..., 0]).T
+    np.testing.assert_array_equal(counts, [[1, 1, 1, 0], [1, 0, 0, 0]])
+    np.testing.assert_array_equal(steps.goes_on[:, 0, 0], [1, 1, 0, 0])
+    # Sums of 0.2, and ten times the first.
+    rewards = np.asarray(steps.reward[..., 0]).T
+    np.testing.assert_allclose(rewards, [[0.2, 0.4, 0.6, 0], [2, 0, 0, 0]], rtol=1e-6)
+    assert np.isfinite(steps.next_obs).all()
+    np.testing.assert_allclose(steps.next_obs[-1, :, 0, 0], [0.6, 0.2], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "reward"), [("two", 2.0), ("minus one", -1.0), ("nothing", 0.0)]
+)
+def test_a_constant_reward_is_worth_its_sum_for_ever(name, reward):
+    learned = learn(name)
+    # What is left of the weights' first values.
+    np.testing.assert_allclose(learned.value(), 10.0 * reward, atol=0.5)
+    np.testing.assert_allclose(learned.metrics.reward, reward, rtol=1e-5)
+    assert learned.metrics.num_skipped == 0
+
+
+def test_nothing_is_to_come_where_trials_end():
+    np.testing.assert_allclose(learn("short").value(), 1.0, atol=0.1)
+
+
+def test_a_reward_behind_the_horizon_is_found():
+    guided, start = learn("far", DIVIDED).guided, jnp.array([-1.0, 0.0])
+    search = toys.optimizer("icem", horizon=3)
+    rollout = jaxpets.particle_rollout(dynamics)
+    blind = jaxpets.plan(rollout, earn, search)
+    assert np.abs(driven(blind, guided.reward, start) - 1.0).min() > 0.5
+    seeing = jaxpets.plan(
+        rollout,
+        LEARNER.reward_fn,
+        search,
+        discount=0.9,
+        value_fn=LEARNER.value_fn,
+    )
+    for planner in (seeing, LEARNER.policy):
+        path = driven(planner, guided, start)
+        assert np.abs(path[-10:] - 1.0).max() < 0.2
+
+
+def test_a_policy_goes_where_its_trial_wants_it():
+    task, networks = learn("anywhere", DIVIDED).guided
+    for place in (-0.8, 0.8):
+        guided = Guided(task._replace(place=jnp.float32(place)), networks)
+        path = driven(LEARNER.policy, guided, jnp.zeros(2))
+        assert np.abs(path[-10:] - place).max() < 0.3
+
+
+def test_rows_that_blow_up_teach_nothing():
+    learned = learn("broken world")
+    assert learned.metrics.num_skipped == 0
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(learned.after.params))
+
+
+def test_steps_that_are_not_finite_are_dropped():
+    learned = learn("broken state")
+    assert learned.metrics.num_skipped == NUM_UPDATES
+    actors = (learned.before.params.actor, learned.after.params.actor)
+    jax.tree.map(np.testing.assert_array_equal, *actors)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        (dict(discount=1.0), ValueError, "discount must be below 1, got 1.0"),
+        (dict(trace=1.5), ValueError, r"trace must be in \[0, 1\], got 1.5"),
+        (dict(horizon=0), ValueError, "horizon must be at least 1, got 0"),
+        (dict(goals=3), TypeError, "goals must be a Goals, got"),
+        (dict(num_members=0), ValueError, "num_members must be at least 1, got 0"),
+        (dict(dynamics_fn=None), TypeError, "dynamics_fn must be a function, got None"),
+        (dict(terminal_fn=1), TypeError, "terminal_fn must be a function, got 1"),
+    ],
+)
+def test_bad_settings_fail_when_built(changes, error, text):
+    with pytest.raises(error, match=text):
+        build(**changes)
+
+
+def test_wrong_arguments_fail_when_traced():
+    learner = build()
+    data = jaxpets.datasets.init(5, 3, 1)
+    params = PlanParams(WORLD, Task())
+    with pytest.raises(ValueError, match=r"dataset.data.obs must be float32\[C, 2\]"):
+        learner.init(params, jax.random.key(0), data)
+    with pytest.raises(TypeError, match="params must be a PlanParams"):
+        learner.init(WORLD, jax.random.key(0), states())
+    with pytest.raises(TypeError, match=r"params.reward must be a Guided"):
+        learner.policy.step(params, jax.random.key(0), (), jnp.zeros(2))
