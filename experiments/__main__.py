@@ -22,6 +22,7 @@ _OTHERS = {
     "study": "explore, perform all tasks and report, one after the other",
     "status": "show what runs do, or how they ended",
     "compare": "show what differs between runs",
+    "play": "show a robot in the browser that does what is typed",
     "doctor": "say whether runs can start here, and what would help",
 }
 _ABOUT = f"""usage: {COMMAND} WORD [FLAG ...]
@@ -48,7 +49,8 @@ def main(argv: Sequence[str]) -> int:
         elif word == "completion":
             print(_completion(rest))
         elif word in _OTHERS:
-            return _module(word).main(rest)
+            module = "play.__main__" if word == "play" else word
+            return _module(module).main(rest)
         else:
             _check_word(word)
             return _module("run").main(argv)

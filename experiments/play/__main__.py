@@ -7,8 +7,8 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-from .. import robots, signals
-from ..errors import InterruptedRun, RunError, UsageError
+from .. import calling, robots, signals
+from ..errors import ExitCode, InterruptedRun, RunError, UsageError
 
 _FROM = "pretrained/best"
 _EPILOG = """
@@ -38,12 +38,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise failed[0]
     except InterruptedRun as error:
         signals.say(f"stopped: {error}.")
-        return error.exit_code
+        return ExitCode(error)
     except RunError as error:
         if args.debug:
             traceback.print_exc()
         signals.say(f"error: {error}")
-        return error.exit_code
+        return ExitCode(error)
     return 0
 
 
@@ -52,22 +52,20 @@ def _serve(args: argparse.Namespace) -> None:
     try:
         with robots.without_gl():
             from . import serve
-    except ImportError as error:
-        raise UsageError(
-            f"the page needs the extra jaxpets[play] ({error}); install it with: "
-            "pip install 'jaxpets[play]'"
-        ) from error
+    except ModuleNotFoundError as error:
+        need = 'pip install "jaxpets[play]"'
+        raise UsageError(f"{error.name} is not installed; {need} brings it.") from error
+
+    def tell(address: str) -> None:
+        print(f"open {address} (Ctrl-C ends it)", flush=True)
+
     options = serve.Options(**{k: v for k, v in vars(args).items() if k != "debug"})
-    serve.serve(options, threading.Event(), _tell)
-
-
-def _tell(address: str) -> None:
-    print(f"open {address} (Ctrl-C ends it)", flush=True)
+    serve.serve(options, threading.Event(), tell)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m experiments.play",
+        prog=calling.usage("play"),
         description="Opens a page in the browser: a robot does what it is asked.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

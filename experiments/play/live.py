@@ -1,58 +1,86 @@
-"""A robot that plans: frames from compiled programs."""
+"""A robot that plans: a plan and what it imagines, then a step of the world.
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+Two programs, as one that calls C MuJoCo cannot be kept by JAX between two processes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+import jaxpets
+from jaxpets import rewards
 from jaxpets.envs import Robot
 
-from .command import Command
-from .core import Core, World
+from .command import Command, RewardChoice, bound, earned_of, reward_of
 from .geometry import pushes
-from .history import Frame
+from .session import Frame
 
 
-class Stepper(Protocol):
-    """What a session shows: it gives a frame for a frame.
+class World(NamedTuple):
+    """Where the robot stands: all that is needed to go on from there.
 
     Attributes:
-      step_time: of a step, in s.
+      env: the environment's state.
+      planner: the warm start of the search.
+      number: `[]` int32, of the steps since the start.
+      qpos: `[Q]`, where it is drawn, in m and rad, and quaternions.
     """
 
-    step_time: float
+    env: jaxpets.EnvState
+    planner: Any
+    number: Array
+    qpos: Array
 
-    @property
-    def pushes(self) -> Mapping[str, np.ndarray]:
-        """Names of the pushes that there are, and the velocities `[V]` each adds."""
-        ...
 
-    def start(self, command: Command) -> Frame:
-        """Returns the first frame of a new trial."""
-        ...
+class Plan(NamedTuple):
+    """A plan, and what it leads to.
 
-    def step(
-        self, frame: Frame, command: Command, push: str | None
-    ) -> tuple[Frame, str]:
-        """Returns the frame after a frame, and why there is none after it, if so."""
-        ...
+    Attributes:
+      planner: the state of the search after it.
+      action: `[A]`, to execute.
+      promised: `[]`, the return that it foresees, per step.
+      disagreement: `[]`, of the members about where it leads, in the units of the
+        model's own noise: the mean over its steps.
+      ghosts: `[E, P, H+1, Q]`, where each particle goes, as it is drawn.
+    """
+
+    planner: Any
+    action: Array
+    promised: Array
+    disagreement: Array
+    ghosts: Array
 
 
 class Live:
-    """A robot that plans for what is asked."""
+    """A robot that plans for what is asked, a `session.Stepper`."""
 
-    def __init__(self, robot: Robot, core: Core, params: Any, seed: int = 0) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        rollout: jaxpets.typing.RolloutFn,
+        search: jaxpets.optimizers.TrajectoryOptimizer,
+        params: Any,
+        *,
+        horizon: int,
+        terminal_fn: Callable[[Any, Array], Array] | None = None,
+    ) -> None:
         self.step_time = robot.step_time
-        self.pushes = pushes(robot.model) if core.push_size else {}
-        self._still = np.zeros(core.push_size, np.float32)
+        reset = jax.eval_shape(robot.env.reset, jax.random.key(0))
+        self.pushes = pushes(robot.model) if hasattr(reset.physics, "qvel") else {}
+        self._still = np.zeros(robot.model.nv, np.float32)
         self._params = params
-        self._key, self._start_key = jax.random.split(jax.random.key(seed))
+        self._key, self._start_key = jax.random.split(jax.random.key(0))
         self._starts = 0
-        self._start, self._plan, self._step = (
-            jax.jit(x) for x in (core.start, core.plan, core.step)
+        planner = jaxpets.plan(
+            rollout, reward_of(robot), search, terminal_fn=terminal_fn
         )
+        self._start = jax.jit(_start(robot, planner))
+        self._plan = jax.jit(_plan(robot, rollout, planner, horizon))
+        self._step = jax.jit(_step(robot))
 
     def start(self, command: Command) -> Frame:
         """Returns the first frame of a new trial; the first call compiles."""
@@ -72,7 +100,6 @@ class Live:
         self, frame: Frame, command: Command, push: str | None
     ) -> tuple[Frame, str]:
         """Returns the frame after a frame, and why a new trial must begin, if so."""
-        assert frame.world is not None
         return self._stepped(frame.world, command, push)
 
     def _stepped(
@@ -100,3 +127,83 @@ class Live:
         if not np.isfinite(frame.qpos).all():
             return frame, "Physics diverged: a new trial has begun."
         return frame, "The trial ended: a new one has begun." if bool(ended) else ""
+
+
+def _start(robot: Robot, planner: jaxpets.Planner) -> Callable[..., World]:
+    track = _track(robot)
+
+    def start(choice: RewardChoice, key: Array) -> World:
+        if robot.task_reset is not None:
+            state = robot.task_reset(choice.task, key)
+        else:
+            state = robot.env.reset(key)
+        qpos = _drawn(state, track(state.obs[None])[0])
+        return World(state, planner.init(), jnp.int32(0), qpos)
+
+    return start
+
+
+def _plan(
+    robot: Robot,
+    rollout: jaxpets.typing.RolloutFn,
+    planner: jaxpets.Planner,
+    horizon: int,
+) -> Callable[..., Plan]:
+    track = _track(robot)
+
+    def plan(params: Any, choice: RewardChoice, key: Array, world: World) -> Plan:
+        obs = world.env.obs
+        choice = bound(choice, world.env.constants)
+        plan_key, ghost_key = jax.random.split(jax.random.fold_in(key, world.number))
+        known = jaxpets.PlanParams(params, choice)
+        output, state = planner.step(known, plan_key, world.planner, obs)
+        path = rollout(params, ghost_key, obs, output.actions[None])[0]
+        spread = jax.vmap(rewards.epistemic, (None, 0, 0, 0))(
+            choice.base, path[:-1], output.actions, path[1:]
+        )
+        each = jax.vmap(jax.vmap(track, 1), 1)(path)  # [E, P, H+1, Q]
+        # It starts where the robot is, also where that is not observed.
+        ghosts = each + (world.qpos - each[:, :, :1])
+        ghosts = jnp.where(jnp.isfinite(ghosts), ghosts, world.qpos)
+        return Plan(
+            state, output.action, output.value / horizon, jnp.mean(spread), ghosts
+        )
+
+    return plan
+
+
+def _step(robot: Robot) -> Callable[..., tuple[World, Array, Array]]:
+    """Returns a step after a push `[V]`, with what it earns and whether it ends."""
+    earned, track = earned_of(robot), _track(robot)
+
+    def step(
+        choice: RewardChoice, push: Array, world: World, plan: Plan
+    ) -> tuple[World, Array, Array]:
+        state = robot.env.step(_pushed(world.env, push), plan.action)
+        choice = bound(choice, state.constants)
+        reward = earned(choice, world.env.obs, plan.action, state.obs)
+        steps = track(jnp.stack([world.env.obs, state.obs]))
+        qpos = _drawn(state, world.qpos + steps[1] - steps[0])
+        ends = robot.env.terminal_fn
+        ended = jnp.zeros((), bool) if ends is None else ends(state.obs)
+        return World(state, plan.planner, world.number + 1, qpos), reward, ended
+
+    return step
+
+
+def _track(robot: Robot) -> Callable[[Array], Array]:
+    assert robot.qpos_fn is not None
+    return robot.qpos_fn
+
+
+def _drawn(state: jaxpets.EnvState, tracked: Array) -> Array:
+    """Returns positions as physics has them, or else as observations tell."""
+    known = getattr(state.physics, "qpos", tracked)
+    return jnp.asarray(known, jnp.float32)
+
+
+def _pushed(state: jaxpets.EnvState, push: Array) -> jaxpets.EnvState:
+    if not hasattr(state.physics, "qvel"):
+        return state
+    physics = state.physics._replace(qvel=state.physics.qvel + push)
+    return state._replace(physics=physics)

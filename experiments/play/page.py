@@ -11,14 +11,13 @@ import viser
 from jaxpets.envs import Robot
 
 from ..errors import RunError, reason
-from . import controls, geometry, readout, recorder
+from . import geometry, readout, recorder
 from .command import Commands
-from .controls import Controls
-from .panel import Panel
+from .controls import Controls, Panel
 from .plan_part import PlanPart
-from .run_part import RunPart
 from .scene import Scene
-from .session import MEMORY, Session
+from .session import Session
+from .watch import RunPart
 
 _WORDS_RATE = 5.0
 
@@ -111,15 +110,13 @@ class Page:
         text = "It takes a moment."
         note = client.add_notification("Saving", text, loading=True)
         name = f"{self._robot.name.replace('/', '-')}.{kind}"
-        seconds = min(max(controls.number(seconds, 15.0), 1.0), MEMORY)
         try:
             with self._is_saving:
                 frames = self._session.history.recent(seconds)
                 if kind == "mp4":
                     data = recorder.mp4(self._env, frames)
                 else:
-                    look = self._part.look
-                    data = recorder.html(self._robot, frames, look)
+                    data = recorder.html(self._robot, frames, self._part.look)
             client.send_file_download(name, data, save_immediately=True)
             note.body = f"{name}, {len(data) / 1e6:.1f} MB"
         except (RunError, OSError, ValueError) as error:

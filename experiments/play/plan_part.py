@@ -9,12 +9,10 @@ from jaxpets import formulas
 
 from . import readout
 from .command import TO_EXPLORE, Commands
-from .controls import Values
-from .history import Frame
-from .panel import Panel, write
+from .controls import Panel, Values, write
 from .readout import small
 from .scene import Look
-from .session import MEMORY, Session
+from .session import MEMORY, Frame, Session
 
 PROMISED, EARNED = "#0072b2", "#d55e00"
 _CURVE_SECONDS = 15.0

@@ -9,7 +9,7 @@ import numpy as np
 from jaxpets.envs import Robot
 
 from .command import TO_EXPLORE, Command
-from .history import Frame
+from .session import Frame
 
 _ON_TIME = 0.97  # of real time; less is said
 

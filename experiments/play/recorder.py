@@ -12,9 +12,9 @@ from jaxpets.envs import Robot
 from ..storage import trajectories
 from ..tools import video
 from . import geometry
-from .history import Frame
 from .scene import Look, Scene
 from .server import serving
+from .session import Frame
 
 _BETWEEN = 2  # pictures per step, so that it moves smoothly
 

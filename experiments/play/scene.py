@@ -11,7 +11,7 @@ import viser
 
 from . import geometry
 from .geometry import Pose, Shape
-from .history import Frame
+from .session import Frame
 
 # By member; they differ also for those who do not see red or green (Okabe and Ito).
 COLORS = np.array(

@@ -15,14 +15,12 @@ import viser
 from .. import build
 from ..errors import UsageError
 from . import command, source
-from .core import core
 from .live import Live
 from .page import Page
 from .plan_part import PlanPart
-from .run_part import RunPart
-from .server import Proxy, serving
+from .server import serving
 from .session import Session
-from .watch import Replay, Watched
+from .watch import Replay, RunPart, Watched
 
 _PORT = 8080
 
@@ -57,15 +55,13 @@ def serve(
       RunError: if there is no such model or run, or the address is not to be had.
     """
     _keep_programs()
-    with serving() as server:
-        proxy, address = _opened(options, server.get_port())
-        tell(address)
-        try:
-            make = _live if options.watch is None else _watching
-            session, page = make(server, options)
-            _run(session, page, is_over, rate)
-        finally:
-            proxy.close()
+    token = secrets.token_urlsafe(16) if options.host else ""
+    listener, address = _opened(options)
+    with serving(listener, token) as server:
+        tell(f"{address}{token}/" if token else address)
+        make = _live if options.watch is None else _watching
+        session, page = make(server, options)
+        _run(session, page, is_over, rate)
 
 
 def _run(session: Session, page: Page, is_over: threading.Event, rate: float) -> None:
@@ -93,12 +89,12 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     found = source.found(options.source, env=options.env, seed=options.seed)
     robot, horizon = found.robot, found.search.horizon
     rollout, _ = build.rollout_of(robot, found.size, found.search)
-    program = core(
-        robot, rollout, build.optimizer(found.search, robot.env), horizon=horizon,
-        terminal_fn=build.imagined_end(robot.env),
+    live = Live(
+        robot, rollout, build.optimizer(found.search, robot.env), found.params,
+        horizon=horizon, terminal_fn=build.imagined_end(robot.env),
     )  # fmt: skip
     commands = command.Commands(robot, found.params)
-    session = Session(Live(robot, program, found.params), commands.first)
+    session = Session(live, commands.first)
     session.notice = "It compiles the planner: some seconds, once on this machine."
     page = Page(
         server, robot, options.env or robot.name, session, found.title, commands,
@@ -120,28 +116,33 @@ def _watching(server: viser.ViserServer, options: Options) -> tuple[Session, Pag
     return session, page
 
 
-def _opened(options: Options, behind: int) -> tuple[Proxy, str]:
-    """Returns what is open to visitors, and its address.
+def _opened(options: Options) -> tuple[socket.socket, str]:
+    """Returns what listens, and its address.
 
     Raises:
       UsageError: if the address is not to be had.
     """
-    host = options.host or "localhost"
-    token = secrets.token_urlsafe(16) if options.host else ""
+    host = options.host or "127.0.0.1"
     port = _PORT if options.port is None else options.port
     try:
-        proxy = Proxy(host, port, behind, token)
+        listener = _listener(host, port)
     except (OSError, OverflowError) as error:
-        why = getattr(error, "strerror", None) or error
-        if options.host:
-            wanted = f"--host {host} with port {port}"
-            raise UsageError(f"{wanted} is not to be had ({why}).") from error
-        if options.port is not None:
-            raise UsageError(f"--port {port} is not to be had ({why}).") from error
-        proxy = Proxy(host, 0, behind, token)
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        if options.host or options.port is not None:
+            said = (
+                f"--host {host} with port {port}" if options.host else f"--port {port}"
+            )
+            why = getattr(error, "strerror", None) or error
+            raise UsageError(f"{said} is not to be had ({why}).") from error
+        listener = _listener(host, 0)
+    name = options.host or "localhost"
+    name = socket.gethostname() if name in ("0.0.0.0", "::") else name
     name = f"[{name}]" if ":" in name else name
-    return proxy, f"http://{name}:{proxy.port}/" + (f"{token}/" if token else "")
+    return listener, f"http://{name}:{listener.getsockname()[1]}/"
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    return socket.create_server(address[:2], family=family)
 
 
 def _keep_programs() -> None:

@@ -1,35 +1,69 @@
-"""Who may see the page: viser, which asks nobody, behind a proxy that does.
+"""Who may see the page: viser, with a guard at its door.
 
-viser listens on this machine alone, at a port that nobody knows. The proxy reads the
-head of every request, turns away what has no business here, and passes the rest on.
+viser itself lets in whoever reaches its port, and lets them change what they like.
 """
 
-import asyncio
 import contextlib
 import hmac
+import http
 import io
-import threading
+import logging
+import secrets
+import socket
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import urlsplit
 
 import viser
+import websockets.asyncio.server as door_of_viser
 from viser import _messages
 
-_HEAD_BYTES = 16_384
-_HEAD_SECONDS = 10.0
-_MAX_CONNECTIONS = 64
 _HERE = ("localhost", "127.0.0.1", "::1")
+# What strangers send is not for the terminal.
+_SILENT = logging.getLogger(f"{__name__}.silent")
+_SILENT.addHandler(logging.NullHandler())
+_SILENT.propagate = False
 
 
 class Server(viser.ViserServer):
-    """A server of which visitors can change the values of controls, and nothing else.
+    """A server whose visitors are let in by `refusal`, and change only values."""
 
-    viser lets a message set any attribute of a control, for all who look.
-    """
+    def __init__(self, listener: socket.socket, token: str) -> None:
+        """Serves.
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
+        Args:
+          listener: where it listens; it is closed with the server.
+          token: see `refusal`.
+        """
+        port, plain = listener.getsockname()[1], door_of_viser.serve
+
+        def guarded(
+            handler: Any, host: str, port: int, *, process_request: Any, **options: Any
+        ) -> Any:
+            def admit(connection: Any, request: Any) -> Any:
+                reason = refusal(request.path, request.headers, token)
+                if reason:
+                    return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+                if token:
+                    request.path = request.path.removeprefix(f"/{token}")
+                return process_request(connection, request)
+
+            del host, port
+            options |= {"process_request": admit, "logger": _SILENT, "sock": listener}
+            return plain(handler, **options)
+
+        door_of_viser.serve = guarded
+        try:
+            super().__init__(host="127.0.0.1", port=0, verbose=False)
+        finally:
+            door_of_viser.serve = plain
+        if self.get_port() != port:  # nobody is let in unseen
+            self.stop()
+            raise RuntimeError(f"viser {viser.__version__} does not open this door")
+        self._change_values_only()
+
+    def _change_values_only(self) -> None:
+        """Keeps messages from setting other attributes of a control, as they could."""
         gui, kind = self.gui, _messages.GuiUpdateMessage
         update = gui._handle_gui_updates
 
@@ -47,10 +81,12 @@ class Server(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def serving() -> Iterator[Server]:
-    """Has a server that listens on this machine alone, and says nothing of it."""
+def serving(listener: socket.socket | None = None, token: str = "") -> Iterator[Server]:
+    """Has a server that says nothing of itself; without a listener nobody sees it."""
+    if listener is None:
+        listener, token = socket.create_server(("127.0.0.1", 0)), secrets.token_hex()
     with contextlib.redirect_stdout(io.StringIO()):
-        server = Server(host="127.0.0.1", port=0, verbose=False)
+        server = Server(listener, token)
     try:
         yield server
     finally:
@@ -58,135 +94,27 @@ def serving() -> Iterator[Server]:
             server.stop()
 
 
-class Refusal(NamedTuple):
-    """Why a request is not passed on."""
-
-    status: str
-    reason: str
-
-
-def checked(head: bytes, token: str) -> bytes | Refusal:
-    """Returns the head of a request as it is passed on, without the token.
+def refusal(path: str, headers: Any, token: str) -> str:
+    """Returns why a request is refused, "" if it is let in.
 
     A page of another site may ask a browser to speak to this machine, and may even give
     its own name this machine's address: so who sends a request from a browser must have
     it from this address, and without a token the address must be that of this machine.
 
     Args:
-      head: of an HTTP request, up to and with the empty line.
+      path: of the request.
+      headers: of the request, a mapping that does not tell cases apart.
       token: the first part of the path must be it; "" for none.
     """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
     try:
-        first, *lines = head.decode("latin-1").rstrip("\r\n").split("\r\n")
-        method, path, version = first.split(" ")
-        fields = [line.split(":", 1) for line in lines]
-        headers = {name.strip().lower(): value.strip() for name, value in fields}
-        host = headers.get("host", "")
         name = urlsplit(f"//{host}").hostname
-        origin = urlsplit(headers.get("origin", f"//{host}")).netloc
+        other = origin is not None and urlsplit(origin).netloc != host
     except ValueError:
-        return Refusal("400 Bad Request", "This is no request.")
-    if method != "GET" or not path.startswith("/"):
-        return Refusal("405 Method Not Allowed", "This page can only be looked at.")
-    if token:
-        own, _, path = path[1:].partition("/")
-        if not hmac.compare_digest(own.encode(), token.encode()):
-            reason = "The address of this page has a token, which the terminal shows."
-            return Refusal("403 Forbidden", reason)
-        path = f"/{path}"
-    elif name not in _HERE:
-        return Refusal("403 Forbidden", "This page is for this machine alone.")
-    if origin != host:
-        return Refusal("403 Forbidden", "This page is not for others to speak to.")
-    return "\r\n".join([f"{method} {path} {version}", *lines, "", ""]).encode("latin-1")
-
-
-class Proxy:
-    """Passes requests on as long as the process lives, or until it is closed."""
-
-    def __init__(self, host: str, port: int, behind: int, token: str) -> None:
-        """Opens it: what comes to `host` and `port` is for the port `behind`.
-
-        Raises:
-          OSError: if that cannot be listened at.
-        """
-        self._behind, self._token, self._count = behind, token, 0
-        self._loop = asyncio.new_event_loop()
-        opening = asyncio.start_server(self._serve, host, port, limit=_HEAD_BYTES)
-        try:
-            self._server = self._loop.run_until_complete(opening)
-        except OSError:
-            self._loop.close()
-            raise
-        self.port: int = self._server.sockets[0].getsockname()[1]
-        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Closes it, and every connection."""
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._server.close()
-        tasks = asyncio.all_tasks(self._loop)
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            self._loop.run_until_complete(asyncio.wait(tasks))
-        self._loop.close()
-
-    async def _serve(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
-        self._count += 1
-        try:
-            if self._count > _MAX_CONNECTIONS:
-                answer = Refusal("503 Service Unavailable", "Too many are looking.")
-            else:
-                async with asyncio.timeout(_HEAD_SECONDS):
-                    head = await reader.readuntil(b"\r\n\r\n")
-                answer = checked(head, self._token)
-            if isinstance(answer, Refusal):
-                await _refuse(writer, answer)
-            else:
-                await self._pass_on(answer, reader, writer)
-        except (OSError, EOFError, asyncio.LimitOverrunError, TimeoutError):
-            pass  # whoever it was is gone, or does not speak HTTP
-        except asyncio.CancelledError:
-            pass  # it is being closed; asyncio would report a task that was cancelled
-        finally:
-            self._count -= 1
-            writer.close()
-
-    async def _pass_on(
-        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
-        inner, outer = await asyncio.open_connection("127.0.0.1", self._behind)
-        outer.write(head)
-        ways = [
-            asyncio.create_task(_pipe(reader, outer)),
-            asyncio.create_task(_pipe(inner, writer)),
-        ]
-        try:
-            # Nobody listens where one side is silent for good.
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for way in ways:
-                way.cancel()
-            outer.close()
-            await asyncio.gather(*ways, return_exceptions=True)
-
-
-async def _pipe(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    while data := await reader.read(65_536):
-        writer.write(data)
-        await writer.drain()
-
-
-async def _refuse(writer: asyncio.StreamWriter, refusal: Refusal) -> None:
-    body = f"{refusal.reason}\n".encode()
-    head = (
-        f"HTTP/1.1 {refusal.status}\r\nContent-Type: text/plain; charset=utf-8\r\n"
-        f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
-    )
-    writer.write(head.encode() + body)
-    await writer.drain()
+        return "This is no request."
+    own = path[1:].partition("/")[0].encode("utf-8", "replace")
+    if token and not hmac.compare_digest(own, token.encode()):
+        return "The address of this page has a token, which the terminal shows."
+    if not token and name not in _HERE:
+        return "This page is for this machine alone."
+    return "This page is not for others to speak to." if other else ""

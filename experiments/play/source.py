@@ -10,7 +10,7 @@ import jaxpets
 from jaxpets import models
 from jaxpets.envs import Robot
 
-from .. import build, exploration, robots
+from .. import build, exploration, robots, user_files
 from ..config import Config, PlannerConfig
 from ..errors import CheckpointError, UsageError
 from ..presets import preset_config
@@ -77,7 +77,8 @@ def _of_file(path: Path, said: str, env: str | None) -> Source:
     name = env or about.get("environment")
     if not isinstance(name, str):
         raise UsageError(f"--env is missing; {said} does not say of which robot it is.")
-    robot = robot_named(name) if env else _by_name(name, said)
+    user_files.check_named("--env", env, name, path)
+    robot = robot_named(name)
     config = model.config
     assert config is not None
     sizes = (model.obs_size, model.action_size)
@@ -85,16 +86,6 @@ def _of_file(path: Path, said: str, env: str | None) -> Source:
     if sizes != robots.sizes(robot) or (own and own != robot.space.coordinates):
         raise UsageError(f"--env {name} is not valid; {said} is of another robot.")
     return Source(robot, config, params, _search(about.get("search"), said), said)
-
-
-def _by_name(name: str, said: str) -> Robot:
-    """Returns the robot that a file names, which may be a stranger's: no file runs."""
-    if name.endswith(".py") or ".py:" in name:
-        raise UsageError(f"--env {name} must be said: it is a file, which runs.")
-    try:
-        return robot_named(name)
-    except UsageError as error:
-        raise UsageError(f"--env is missing; {said} is of {name!r}: {error}") from error
 
 
 def _search(said: Any, where: str) -> PlannerConfig:
