@@ -61,27 +61,11 @@ def serve(
         tell(f"{address}{token}/" if token else address)
         make = _live if options.watch is None else _watching
         session, page = make(server, options)
-        _run(session, page, is_over, rate)
-
-
-def _run(session: Session, page: Page, is_over: threading.Event, rate: float) -> None:
-    """Runs the world beside the page until it is over, or the world cannot begin."""
-    failed: list[Exception] = []
-
-    def run() -> None:
-        try:
-            session.run(page.steer)
-        except Exception as error:
-            failed.append(error)
-            is_over.set()
-
-    world = threading.Thread(target=run, daemon=True)
-    world.start()
-    page.run(is_over.wait, rate)
-    session.stop()
-    world.join()
-    if failed:
-        raise failed[0]
+        world = threading.Thread(target=session.run, args=(page.steer,), daemon=True)
+        world.start()
+        page.run(is_over.wait, rate)
+        session.stop()
+        world.join()
 
 
 def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:

@@ -161,12 +161,7 @@ class Session:
 
         Args:
           steer: called before every step; reads controls and gives orders.
-
-        Raises:
-          Exception: if it cannot begin.
         """
-        self.restart()
-        self.notice = ""
         while not self._stopped.is_set():
             try:
                 self.tick(steer)
@@ -233,6 +228,10 @@ class Session:
         self._step()
 
     def _step(self) -> None:
+        if self.shown is None:
+            self.restart()
+            self.notice = ""
+            return
         last, push, self._push = self.history.at(0.0), self._push, None
         self.clock.begin(self.speed)
         frame, over = self.stepper.step(last, self.command, push)
