@@ -1,6 +1,8 @@
 """The page's parts that need no browser: what is asked, computed, timed and let in."""
 
 import contextlib
+import dataclasses
+import queue
 import signal
 import socket
 import sys
@@ -34,13 +36,22 @@ from jaxpets import envs, rewards
 
 viser = pytest.importorskip("viser", reason="the extra jaxpets[play] is not installed")
 
+import msgspec  # noqa: E402
+import zstandard  # noqa: E402
 from websockets.datastructures import Headers  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from experiments.play import geometry, serve, server, source  # noqa: E402
+from experiments.play import (  # noqa: E402
+    geometry,
+    recorder,
+    serve,
+    server,
+    source,
+)
 from experiments.play.controls import Controls, Press, Values  # noqa: E402
 from experiments.play.live import Live  # noqa: E402
+from experiments.play.scene import Look  # noqa: E402
 
 STEP = 0.05
 
@@ -483,6 +494,103 @@ def test_the_door_is_guarded(capfd):
     with pytest.raises(OSError, match="refused"):
         said(port, whole)
     assert capfd.readouterr() == ("", "")
+
+
+# The whole of it, as a page would speak to it; see also test_play_browser.py.
+
+
+class Visitor:
+    """Speaks to a page as a browser does, and knows the controls that it is shown."""
+
+    def __init__(self, address):
+        protocol = f"viser-v{viser.__version__}"
+        url = address.replace("http", "ws")
+        self.socket = connect(url, subprotocols=[protocol], max_size=None)
+        self.uuids, self.texts, self.places = {}, {}, set()
+        camera = dict.fromkeys(("position", "look_at", "up_direction"), (1.0, 0.0, 0.0))
+        sizes = dict.fromkeys(("fov", "near", "far", "image_height", "image_width"), 1)
+        self.send("ViewerCameraMessage", wxyz=(1.0, 0.0, 0.0, 0.0), **camera, **sizes)
+
+    def hear(self):
+        packet = self.socket.recv(timeout=60)
+        size, packed = np.frombuffer(packet[:16], np.uint64).tolist()
+        plain = zstandard.ZstdDecompressor().decompress(packet[16 : 16 + packed], size)
+        for message in msgspec.msgpack.decode(plain)["messages"]:
+            props = message.get("props", message.get("updates", {}))
+            if "label" in props:
+                self.uuids.setdefault(props["label"], message["uuid"])
+            for name in {"content", "value"} & props.keys():
+                self.texts[message["uuid"], name] = str(props[name])
+            if message.get("name") == "/robot/0":
+                self.places.add(packet[16 + packed :])
+
+    def until(self, is_so):
+        deadline = time.monotonic() + 60
+        while not is_so():
+            assert time.monotonic() < deadline
+            self.hear()
+
+    def sees(self, text):
+        self.until(lambda: any(text in shown for shown in self.texts.values()))
+
+    def sets(self, name, value, field="value"):
+        uuid, updates = self.uuids[name], {field: value}
+        self.send("GuiUpdateMessage", uuid=uuid, updates=updates)
+
+    def send(self, kind, **fields):
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+
+@pytest.fixture
+def visitor(monkeypatch):
+    """Somebody who looks at a page on which little is planned."""
+    found = source.found("pretrained/best")
+    sizes = {"horizon": 4, "num_samples": 8, "num_elites": 2, "num_iterations": 2}
+    small = found._replace(search=dataclasses.replace(found.search, **sizes))
+    monkeypatch.setattr(source, "found", lambda *_, **__: small)
+    told, is_over = queue.Queue(), threading.Event()
+    options = serve.Options("pretrained/best", port=0, host="127.0.0.1")
+    args = (options, is_over, told.put)
+    thread = threading.Thread(target=serve.serve, args=args, kwargs={"rate": 10.0})
+    thread.start()
+    visitor = Visitor(told.get(timeout=60))
+    yield visitor
+    visitor.socket.close()
+    is_over.set()
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+def test_a_page_does_what_visitors_ask(visitor):
+    visitor.sees("It performs forward.")
+    visitor.sets("task", "backward")
+    visitor.sees("-velocity - 0.1 * effort")
+    visitor.sets("reward", "velocity + heigt")
+    visitor.sees("There is no &#x27;heigt&#x27;, but height")
+    for bad in (None, [1], {"a": 1}, float("nan"), 2**63):
+        visitor.sets("velocity", bad)
+    visitor.sets("velocity", 1, field="removed")
+    for value in np.linspace(-6, 6, 500).round(1).tolist():
+        visitor.sets("velocity", value)
+    visitor.sets("velocity", 2.0)
+    visitor.sees("-abs(velocity - 2) - ")
+    visitor.sees("It does what the line says.")
+    visitor.until(lambda: len(visitor.places) > 9)  # it moves
+    visitor.sets("push", "push on")
+    visitor.sets("or", "explore")
+    visitor.sees("It seeks what its networks disagree about.")
+    visitor.sets("go back", -0.5)
+    visitor.sees("0.5 s ago")
+    visitor.sets("and", "go on from here")
+    visitor.sees("of the model's own noise")
+
+
+def test_what_was_seen_is_one_file(cheetah, commands, live):
+    frames = [live.start(commands.first)]
+    for _ in range(2):
+        frames.append(live.step(frames[-1], commands.first, None)[0])
+    page = recorder.html(cheetah[0], frames, Look())
+    assert page.startswith(b"<!") and len(page) > 500_000
 
 
 # The command line.

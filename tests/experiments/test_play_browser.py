@@ -1,8 +1,8 @@
 """The page as visitors have it: in Chromium, with the model and the robot that ship.
 
-The tests share a server and go on from each other, on software's OpenGL: minutes. They
-are skipped without playwright or Chromium, which CHROMIUM may name, and so in CI. PICTURES
-names a folder for the picture that they make.
+The tests share a server and go on from each other, on software's OpenGL: minutes.
+They are skipped without playwright or Chromium, which CHROMIUM may name, and so in CI.
+PICTURES names a folder for the picture that they make.
 """
 
 import contextlib

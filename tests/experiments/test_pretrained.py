@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from pathlib import Path
 
 import chex
@@ -185,6 +186,7 @@ def test_a_page_plans_with_the_model_of_a_run(explored):
 
 def test_a_run_is_watched_while_it_explores(explored, tmp_path):
     pytest.importorskip("viser", reason="the extra jaxpets[play] is not installed")
+    from experiments.play import serve, server
     from experiments.play.command import NOTHING
     from experiments.play.watch import Replay, Watched
 
@@ -202,5 +204,11 @@ def test_a_run_is_watched_while_it_explores(explored, tmp_path):
     assert replay.trial == runs.LAST and len(frames) == runs.STEPS
     assert found[1] == "It is shown again."
     assert frames[-1].obs[0] != frames[0].obs[0]
-    assert [row["trial"] for row in run.rows()] == [1, 2, 3]
+    with server.serving() as site:
+        session, page = serve._watching(site, serve.Options("", watch=begun))
+        session.restart()
+        page._speak(time.monotonic())
+        for chart in (page._part._value, page._part._error, page._part._returns):
+            np.testing.assert_array_equal(chart.data[0], [1, 2, 3])
+        assert "Trial 3 is shown. The run is " in page._part._text.content
     assert before == {x: x.stat().st_mtime_ns for x in begun.rglob("*")}
