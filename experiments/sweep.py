@@ -14,9 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from . import calling, cli, grid, robots, run, signals, status
-from .errors import CheckpointError, InterruptedRun, RunError, UsageError, last_line
+from .errors import (
+    CheckpointError,
+    InterruptedRun,
+    RunError,
+    UsageError,
+    last_line,
+    storage_errors,
+)
 from .grid import Job, Sweep
-from .storage import rundir
+from .storage import disk, rundir
 from .storage.status import COMPLETE, read
 
 _EPILOG = """
@@ -164,7 +171,8 @@ def _here(
         devices.put(gpus[i % len(gpus)] if gpus else None)
     shared = -(-count // len(gpus)) if gpus else 1
     logs = Path(sweep.out) / "logs"
-    logs.mkdir(parents=True, exist_ok=True)
+    with storage_errors(f"use {logs}"):
+        disk.make(logs)
     stop = threading.Event()
 
     def one(job: Job) -> int:
@@ -172,7 +180,7 @@ def _here(
             return InterruptedRun.exit_code
         device = devices.get()
         log, begin = logs / f"{job.name}.txt", time.monotonic()
-        with log.open("a") as file:
+        with disk.opened(log, os.O_WRONLY | os.O_APPEND) as file:
             process = subprocess.Popen(
                 [*command, job.name],
                 stdout=file,
