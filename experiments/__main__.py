@@ -20,6 +20,7 @@ _PHASES = {
 # Modules with a `main` of their own, by the word that calls them.
 _OTHERS = {
     "study": "explore, perform all tasks and report, one after the other",
+    "sweep": "do a grid of runs, on this machine's GPUs or on SLURM",
     "status": "show what runs do, or how they ended",
     "compare": "show what differs between runs",
     "play": "show a robot in the browser that does what is typed",

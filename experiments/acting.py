@@ -12,6 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from jaxpets.envs import Robot, with_constants
+from jaxpets.policies import Guided
 
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
@@ -68,7 +69,7 @@ class Scorer(NamedTuple):
 
 
 def explorers(
-    env: jaxpets.Env, planner: jaxpets.Planner, horizon: int, length: int,
+    env: jaxpets.Env, planner: jaxpets.Planner, horizon: float, length: int,
     placement: Placement, bind: Bind = lambda data, constants: data,
 ) -> Actors:  # fmt: skip
     """Returns actors over seeds `[S]`; params and reward data are per seed."""
@@ -80,28 +81,49 @@ def explorers(
 def evaluators(
     robot: Robot,
     planner: jaxpets.Planner,
-    horizon: int,
+    horizon: float,
     length: int,
     placement: Placement,
-    *,
-    shared_model: bool,
+    params: jaxpets.PlanParams,
 ) -> Actors:
     """Returns actors over seeds, tasks and trials `[S, K, R]`.
 
-    The task's params are `[K]`. The model is `[S]` where all tasks share it, else
-    `[S, K]`.
+    Args:
+      robot: that acts.
+      planner: not jitted; its reward data are the params of a task, or Guided.
+      horizon: steps that the value of a plan is the sum of.
+      length: steps of a chunk.
+      placement: of the actors.
+      params: which of these axes the leaves of PlanParams have, as PartitionSpecs.
     """
-    env_of = functools.partial(at_start, robot)
-    start, chunk = _one(env_of, planner, horizon, length, with_constants)
-    model = None if shared_model else 0
-    over_trials = jax.vmap(chunk, (None, 0, 0))
-    over_tasks = jax.vmap(over_trials, (jaxpets.PlanParams(model, 0), 0, 0))
-    over_seeds = jax.vmap(over_tasks, (jaxpets.PlanParams(0, None), 0, 0))
-    over_tasks_start = jax.vmap(jax.vmap(start, (None, 0)))
-    starts = jax.vmap(over_tasks_start, (None, 0))
-    models = P(SEED) if shared_model else P(SEED, TASK)
-    params = jaxpets.PlanParams(models, P(TASK))
-    return _actors(placement, starts, over_seeds, params, *AXES)
+
+    def env_of(data: Any) -> jaxpets.Env:
+        return at_start(robot, _task(data))
+
+    def bind(data: Any, constants: Any) -> Any:
+        if isinstance(data, Guided):
+            return data._replace(reward=with_constants(data.reward, constants))
+        return with_constants(data, constants)
+
+    start, chunk = _one(env_of, planner, horizon, length, bind)
+    starts, chunks = jax.vmap(start, (None, 0)), jax.vmap(chunk, (None, 0, 0))
+    every = P(*AXES)
+    for axis in (TASK, SEED):
+        starts = over(starts, (params.reward, every), axis)
+        chunks = over(chunks, (params, every, every), axis)
+    return _actors(placement, starts, chunks, params, *AXES)
+
+
+def over(function: Callable[..., Any], takes: Any, axis: str) -> Callable[..., Any]:
+    """Maps over the leading axis of what has this axis.
+
+    Args:
+      function: not jitted.
+      takes: a prefix of the arguments' pytree: PartitionSpecs.
+      axis: of AXES; those after it are mapped already.
+    """
+    axes = jax.tree.map(lambda spec: 0 if axis in spec else None, takes)
+    return jax.vmap(function, axes)
 
 
 def run(
@@ -154,6 +176,11 @@ def at_start(robot: Robot, task: Any) -> jaxpets.Env:
     if robot.task_reset is None:
         return robot.env
     return robot.env._replace(reset=functools.partial(robot.task_reset, task))
+
+
+def _task(data: Any) -> Any:
+    """Returns the params of the task that reward data are about."""
+    return data.reward if isinstance(data, Guided) else data
 
 
 def split_keys(keys: Array) -> tuple[Array, Array]:
@@ -222,7 +249,7 @@ def _actors(
 
 
 def _one(
-    env_of: Callable[[Any], jaxpets.Env], planner: jaxpets.Planner, horizon: int,
+    env_of: Callable[[Any], jaxpets.Env], planner: jaxpets.Planner, horizon: float,
     length: int, bind: Bind,
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:  # fmt: skip
     """Returns `start` and `chunk` of one actor; the reward's data say where it acts."""

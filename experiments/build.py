@@ -12,6 +12,7 @@ from jax import Array
 
 import jaxpets
 from jaxpets.envs import Robot
+from jaxpets.policies import ActorCritic
 
 from . import robots
 from .acting import Bind
@@ -23,13 +24,14 @@ from .config import (
     TrainingConfig,
     part,
 )
+from .critic import TerminalFn, make_critic
 
 State = jaxpets.typing.LearnerState
-KERNEL, SCAN = "kernel", "scan"
+KERNEL, SCAN, NOTHING = "kernel", "scan", "none"
 Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
 # Every phase draws from its own stream of keys.
-EXPLORE, ZERO_SHOT, FINETUNE, REFIT = 0, 1, 2, 3
+EXPLORE, ZERO_SHOT, FINETUNE, REFIT, CRITIC = 0, 1, 2, 3, 4
 
 
 class Parts(NamedTuple):
@@ -39,7 +41,8 @@ class Parts(NamedTuple):
     model: jaxpets.Ensemble  # in the precision that trains
     random: jaxpets.Planner
     explorer: jaxpets.Planner  # phase 1
-    actor: jaxpets.Planner  # phase 2; reward data are the params of a task
+    actor: jaxpets.Planner  # phase 2; reward data are a task's params, or Guided
+    critic: ActorCritic | None  # what guides zero-shot
     learner: jaxpets.Learner  # phase 1
     reward_data: jaxpets.RewardData  # of its reward
     bind: Bind  # what gives them the constants of a trial
@@ -61,17 +64,25 @@ def build(config: Config) -> Parts:
     finetuned = config.finetune_trials * config.task_length
 
     def planner(
-        reward_fn: jaxpets.typing.RewardFn, search: PlannerConfig
+        reward_fn: jaxpets.typing.RewardFn, search: PlannerConfig, **behind: Any
     ) -> tuple[jaxpets.Planner, str]:
         rollout, kind = rollout_of(robot, size, search)
         unroll = kind.startswith(KERNEL) and jax.default_backend() == "gpu"
         search_fn = optimizer(search, env, unroll)
-        planner = jaxpets.plan(rollout, reward_fn, search_fn, terminal_fn=terminal_fn)
+        planner = jaxpets.plan(
+            rollout, reward_fn, search_fn, terminal_fn=terminal_fn, **behind
+        )
         return planner, kind
 
     reward = robot.tasks.reward_fn
     if config.pessimism:
         reward = jaxpets.rewards.pessimistic(reward, config.pessimism)
+    guided = config.phase == "zero-shot" and config.critic.num_updates
+    critic = None
+    if guided:
+        precision = jaxpets.Precision(config.task_planner.precision)
+        model = _ensemble(robot, size, precision)
+        critic = make_critic(config, robot, model, terminal_fn)
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
     def learner(
@@ -82,16 +93,27 @@ def build(config: Config) -> Parts:
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
 
-    explorer, explored_by = arm.planner or random, "none"
+    explorer, explored_by = arm.planner or random, NOTHING
     if arm.reward_fn is not None:
         explorer, explored_by = planner(arm.reward_fn, config.planner)
-    actor, performed_by = planner(reward, config.task_planner)
+    if critic is None:
+        actor, performed_by = planner(reward, config.task_planner)
+    elif config.critic.acts:
+        actor, performed_by = critic.policy, NOTHING
+    else:
+        actor, performed_by = planner(
+            critic.reward_fn,
+            config.task_planner,
+            value_fn=critic.value_fn,
+            discount=config.critic.discount,
+        )
     return Parts(
         robot=robot,
         model=trained,
         random=random,
         explorer=explorer,
         actor=actor,
+        critic=critic,
         learner=learner(
             config.training, arm.reward_data, config.trial_length, explored
         ),
@@ -215,7 +237,7 @@ def rollout_of(
     return rollout, SCAN
 
 
-def imagined_end(env: jaxpets.Env) -> Callable[[Any, Array], Array] | None:
+def imagined_end(env: jaxpets.Env) -> TerminalFn:
     """Returns what ends an imagined trial where a real one ends, if one ever does."""
     ends = env.terminal_fn
     return None if ends is None else lambda params, obs: ends(obs)

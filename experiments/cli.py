@@ -93,6 +93,14 @@ def results_folder(config: Config) -> Path:
     return config.out.resolve() / f"pretrained-{source.name}"
 
 
+def variant(config: Config, step: int) -> str:
+    """Returns the name of the folder of a later phase: zero-shot-060-TASKS-TASK-TAG."""
+    tasks = [rundir.label(config.tasks)] if config.tasks else []
+    task = [config.task] if config.task != "all" else []
+    tag = [config.tag] if config.tag else []
+    return "-".join([config.phase, f"{step:03d}", *tasks, *task, *tag])
+
+
 def _phase(argv: Sequence[str]) -> tuple[Phase, list[str]]:
     """Returns the phase and the rest of a command line; it may be the first word."""
     word = bool(argv) and not argv[0].startswith("-")
@@ -161,6 +169,7 @@ def _check_pretrained(config: Config) -> None:
     if explored_run(config).parent == PRETRAINED.resolve():
         valid = "zero-shot; a model that comes with the code performs, no more"
         require(config.phase == "zero-shot", "--phase", config.phase, valid)
-        epochs = config.refit.num_epochs
         valid = "0; a model that comes with the code has no data"
+        epochs, updates = config.refit.num_epochs, config.critic.num_updates
         require(epochs == 0, "--refit.num-epochs", epochs, valid)
+        require(updates == 0, "--critic.num-updates", updates, valid)

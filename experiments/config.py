@@ -1,20 +1,20 @@
 """Every number of the experiments: the flags, their ranges and what each is for.
 
 The fields of a Config are declared by what they do. What decides about the numbers of a
-run is `Science`; what says where files are, how fast it goes or which process this is
-stands apart, so that two runs are the same where their `Run` parts are equal.
+run is `Science`; what does not is in `place`, so that two runs are the same where their
+`Run` parts are equal.
 """
 
 import dataclasses
 import enum
-from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import tyro
 from msgspec import Meta
 
 from jaxpets import EnsembleConfig, FitConfig
+from jaxpets.policies import ActorCriticConfig
 
+from .place import Compute, Origin, Output, Process, Steps
 from .storage.rundir import HALF_CHEETAH
 
 Phase = Literal["explore", "zero-shot", "finetune", "report"]
@@ -63,7 +63,6 @@ EXPLORED, COUNTED, GOAL = Mark
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Trials = Annotated[int, Meta(ge=1, le=100_000)]
 TaskTrials = Annotated[int, Meta(ge=1, le=10_000)]
-Steps = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,6 +136,36 @@ class PlannerConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CriticConfig:
+    """An actor and a critic of every task, which learn in imagination for zero-shot."""
+
+    num_updates: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
+    """Gradient steps, at least; 0: a plan sees its horizon and nothing behind it."""
+    acts: bool = False
+    """The actor acts alone: nothing is planned."""
+    learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
+    """Of Adam, at first; it falls to a twentieth."""
+    hidden_size: Annotated[int, Meta(ge=1, le=8192)] = ActorCriticConfig.hidden_size
+    """Width of the networks' layers."""
+    batch_size: Annotated[int, Meta(ge=1, le=65_536)] = ActorCriticConfig.batch_size
+    """Imagined rows per gradient step, at least."""
+    horizon: Annotated[int, Meta(ge=1, le=1000)] = ActorCriticConfig.horizon
+    """Steps that they are imagined for in a gradient step."""
+    discount: Annotated[float, Meta(ge=0.0, le=0.9999)] = 0.99
+    """Per step of the environment, also of plans that end with the critic."""
+    trace: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
+    """lambda of the returns that the critic learns."""
+    noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.5
+    """On imagined actions, in half widths of their range."""
+    restart: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
+    """Chance per gradient step that an imagined trial begins anew."""
+    target_rate: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
+    """Share of the critics that their slow copies take over in a gradient step."""
+    pessimism: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    """1: learn from the lesser of two critics; 0: from their mean."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Phased:
     """What is to be done."""
 
@@ -198,6 +227,7 @@ class Evaluation:
     """Standard deviations between members taken off the reward of a task."""
     refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
     task_planner: PlannerConfig = PlannerConfig()
+    critic: CriticConfig = CriticConfig()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,55 +261,6 @@ class Variant:
 @dataclasses.dataclass(frozen=True)
 class Run(Variant, Science, Phased):
     """What a run is: where these are equal, it is the same one."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Output:
-    """Where runs are."""
-
-    out: Path = Path("runs")
-    """Folder of all runs."""
-    name: str | None = None
-    """Name of the exploration run; by default PRESET-ARM, or PRESET-ROBOT-ARM."""
-    track: Literal["tensorboard", "wandb", "trackio"] | None = None
-    """Show the run in a tracker, too."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Origin:
-    """What phase 2 starts from, and its video."""
-
-    source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """The exploration run to start from; by default OUT/NAME."""
-    at_trial: int | None = None
-    """Use the explored model as it was after this trial; by default the last."""
-    video: Path | None = None
-    """Render a trial of each task to this mp4."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Compute:
-    """How much is computed at a time; no number depends on it."""
-
-    chunk_length: Steps = 50
-    """Environment steps per call of the compiled program."""
-    allow_cpu: bool = False
-    """Start on a CPU although planning would take over an hour."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Process:
-    """Which process of how many this is."""
-
-    coordinator_address: str | None = None
-    """HOST:PORT of process 0, where several processes share the seeds; the same command
-    on each. auto: as SLURM, Open MPI or Kubernetes say, a process per GPU."""
-    num_processes: Annotated[int, Meta(ge=1, le=100_000)] | None = None
-    """How many processes share the seeds."""
-    process_id: Annotated[int, Meta(ge=0, le=99_999)] | None = None
-    """Which of them this is; only the folder of process 0 is used."""
-    debug: bool = False
-    """Show tracebacks."""
 
 
 @dataclasses.dataclass(frozen=True)

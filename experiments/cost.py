@@ -58,7 +58,10 @@ def check_cpu(config: Config) -> None:
     read = jax.eval_shape(robot.space.features, obs).shape[0] + action_size
     hidden = [config.model.hidden_size] * config.model.num_layers
     flops = model_flops([read, *hidden, 2 * obs_size])
-    hours = flops * rows * search.horizon * steps / _CPU_FLOPS_AN_HOUR
+    if config.phase == "zero-shot" and config.critic.acts:
+        rows = 0
+    steps = rows * search.horizon * steps + _critic_steps(config)
+    hours = flops * steps / _CPU_FLOPS_AN_HOUR
     if hours > 1:
         raise UsageError(
             f"--phase {config.phase} of --preset {config.preset} would take about "
@@ -87,6 +90,16 @@ def _search(config: Config) -> tuple[str, PlannerConfig]:
     if config.phase == "explore":
         return "planner", config.planner
     return "task-planner", config.task_planner
+
+
+def _critic_steps(config: Config) -> int:
+    """Returns about as many imagined steps as critics of zero-shot cost."""
+    if config.phase != "zero-shot":
+        return 0
+    critic = config.critic
+    rows = critic.num_updates * critic.batch_size * critic.horizon
+    networks = len(config.seeds) * _num_tasks(config)
+    return 3 * rows * networks  # the networks themselves cost about twice the model
 
 
 def _num_tasks(config: Config) -> int:

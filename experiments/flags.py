@@ -17,19 +17,10 @@ from tyro.constructors import (
 )
 
 from . import calling
-from .config import (
-    Basics,
-    Compute,
-    Config,
-    Origin,
-    Output,
-    Process,
-    Science,
-    Variant,
-    part,
-)
+from .config import Basics, Config, Science, Variant, part
 from .entries import entries, flag, hints, read
 from .errors import UsageError
+from .place import Compute, Origin, Output, Process
 
 T = TypeVar("T")
 

@@ -7,14 +7,16 @@ trials are the leading axes of every array.
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from jaxpets.envs import Tasks
+from jaxpets.policies import Guided
 
 from . import acting, cost, exploration, loop, records, robots
 from .acting import Actors, Scorer, Tick, Trials
@@ -24,7 +26,6 @@ from .build import (
     SCAN,
     ZERO_SHOT,
     Learn,
-    Parts,
     State,
     build,
     key_per,
@@ -33,6 +34,7 @@ from .build import (
 from .config import UNPLANNED, Config
 from .parallel import devices
 from .parallel.devices import SEED, TASK, Placement
+from .preparation import prepared
 from .progress import Progress, Watch
 from .refit import refit
 from .report import coverage
@@ -168,18 +170,24 @@ def zero_shot(
         return
     parts = build(config)
     _say_rollout(run, parts.performed_by)
-    model = _model(config, source, run, step, parts)
+    model = prepared(config, source, run, step, parts, tasks)
     placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
+    task_params = devices.place(placement, tasks.params, TASK)
+    horizon, axes = float(config.task_planner.horizon), P(TASK)
+    if parts.critic:
+        networks = devices.place(placement, model.reward, SEED, TASK)
+        task_params = Guided(task_params, networks)
+        horizon = 1 / (1 - config.critic.discount)
+        axes = Guided(axes, cast(Any, P(SEED, TASK)))
     actors = acting.evaluators(
-        robot, parts.actor, config.task_planner.horizon, config.chunk_length,
-        placement, shared_model=True,
+        robot, parts.actor, horizon, config.chunk_length, placement,
+        jaxpets.PlanParams(P(SEED), axes),
     )  # fmt: skip
     keys = trial_keys(config, ZERO_SHOT, step)
     keys = key_per(robots.places(robot, tasks), keys)
     keys = key_per(range(config.eval_trials), keys)
     params = jaxpets.PlanParams(
-        devices.place(placement, model.params, SEED),
-        devices.place(placement, tasks.params, TASK),
+        devices.place(placement, model.params, SEED), task_params
     )
     num_chunks = config.task_length // config.chunk_length
     progress = Progress(config.task_length, 0, "zero-shot", watch)
@@ -222,7 +230,7 @@ def finetune(
         placement=placement,
         actors=acting.evaluators(
             robot, parts.actor, config.task_planner.horizon, config.chunk_length,
-            placement, shared_model=False,
+            placement, jaxpets.PlanParams(P(SEED, TASK), P(TASK)),
         ),
         learn=loop.over_branches(placement, parts.finetuner, SEED, TASK),
         tasks=tasks._replace(params=devices.place(placement, tasks.params, TASK)),
@@ -252,22 +260,6 @@ def finetune(
         shown = Trials(seen, jnp.zeros(()), constants)
         paths = records.trajectories(phase.scorer, shown, config.seeds, tasks.names)
         run.save_trajectories(paths)
-
-
-def _model(
-    config: Config, source: RunFolder, run: RunFolder, step: int, parts: Parts
-) -> State:
-    """Returns the model `[S]` to plan tasks with, from a stopped run or made anew."""
-    template = exploration.model_of(exploration.template(config, parts))
-    if found := run.restore(template):
-        return found[1]
-    if parts.refitter:
-        state = source.restore_trial(step, exploration.as_saved(config, parts))
-        model = exploration.model_of(refit(config, parts, state, step, run))
-    else:  # all but the model may be missing there
-        model = source.restore_trial(step, template, part=True)
-    run.save(step, model)
-    return model
 
 
 def _say_rollout(run: RunFolder, rollout: str) -> None:

@@ -25,7 +25,6 @@ from .errors import (
 )
 from .parallel import distributed
 from .progress import Watch
-from .storage import rundir
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
     from .storage.folder import RunFolder
@@ -96,7 +95,7 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
         run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
         return
     step = _explored_step(config, source)
-    folder = cli.results_folder(config) / _variant(config, step)
+    folder = cli.results_folder(config) / cli.variant(config, step)
     with _opened(config, folder) as run:
         from . import phases
 
@@ -105,14 +104,6 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
         if config.video is not None and distributed.is_first():
             with_gl()
             _video(config, run, step, watch)
-
-
-def _variant(config: Config, step: int) -> str:
-    """Returns the name of the folder of a later phase: zero-shot-060-TASKS-TASK-TAG."""
-    tasks = [rundir.label(config.tasks)] if config.tasks else []
-    task = [config.task] if config.task != "all" else []
-    tag = [config.tag] if config.tag else []
-    return "-".join([config.phase, f"{step:03d}", *tasks, *task, *tag])
 
 
 @contextmanager

@@ -37,6 +37,7 @@ def validate(config: Config) -> None:
         divides = length % config.chunk_length == 0
         valid = f"a divisor of the length of a trial ({length})"
         require(divides, "--chunk-length", config.chunk_length, valid)
+    _check_critic(config)
     if config.video is not None:
         good = config.video.suffix == ".mp4"
         require(good, "--video", config.video, "a .mp4 file")
@@ -56,6 +57,18 @@ def _check_members(config: Config) -> None:
         config.pessimism,
         "0 with one member; it never disagrees",
     )
+
+
+def _check_critic(config: Config) -> None:
+    updates = config.critic.num_updates
+    if not updates:
+        alone = "left out without --critic.num-updates"
+        require(not config.critic.acts, "--critic.acts", "", alone)
+    if config.phase == "finetune":
+        require(not updates, "--critic.num-updates", updates, "0 in finetune")
+    if updates:
+        alone = "0 with a critic, which is asked about one member at a time"
+        require(not config.pessimism, "--pessimism", config.pessimism, alone)
 
 
 def _check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:

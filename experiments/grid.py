@@ -1,0 +1,130 @@
+"""A sweep's file: which runs there are, and the command lines of each."""
+
+import itertools
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+
+from .errors import UsageError, printable
+from .storage import rundir
+
+_NAME = msgspec.Meta(
+    pattern=r"^[a-z][a-z-]*(\.[a-z-]+)*\Z", description="a flag's name"
+)
+Flags = dict[str, Any]  # a table in a table is a group: planner.horizon
+Plain = bool | int | float | str
+Grid = dict[Annotated[str, _NAME], Annotated[list[Any], msgspec.Meta(min_length=1)]]
+
+
+class Where(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """Flags of the runs whose place in the grid is among these."""
+
+    grid: Grid
+    flags: Flags
+
+
+class Sweep(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """What a file says."""
+
+    out: str
+    grid: Grid
+    flags: Flags = {}
+    where: list[Where] = []
+    then: list[Flags] = []
+    slurm: dict[str, Any] = {}
+
+
+class Job(NamedTuple):
+    """One run: its folder in the sweep's, and a command line for each phase."""
+
+    name: str
+    commands: list[list[str]]
+
+
+def read(path: Path) -> Sweep:
+    """Returns what a file says.
+
+    Raises:
+      UsageError: naming the file, and what in it is not valid.
+    """
+    try:
+        with path.open("rb") as file:
+            return msgspec.convert(tomllib.load(file), Sweep)
+    except (OSError, ValueError) as error:  # msgspec's and tomllib's are ValueErrors
+        raise UsageError(f"{path} is no sweep: {error}") from error
+
+
+def jobs(sweep: Sweep) -> Iterator[Job]:
+    """Returns the runs of a sweep, the last entry of its grid the fastest.
+
+    Raises:
+      UsageError: if there is no name for a run, or a value is not one of a flag.
+    """
+    for values in itertools.product(*sweep.grid.values()):
+        place = dict(zip(sweep.grid, values, strict=True))
+        flags = _flat(sweep.flags)
+        for where in sweep.where:
+            if all(place.get(name) in among for name, among in where.grid.items()):
+                flags |= _flat(where.flags)
+        flags |= {name: _checked(name, value) for name, value in place.items()}
+        name = "-".join(rundir.label(_words(value)) for value in values)
+        rundir.check_name(name)
+        own = ["--out", sweep.out, "--name", name]
+        commands = [["explore", *own, *_line(flags)]]
+        # A user's file has to be named again, since no run's config may name one.
+        own += _line({x: place[x] for x in ("env", "arm") if x in place})
+        for later in sweep.then:
+            phase, *rest = _phase(later)
+            commands.append([phase, *own, *rest])
+        yield Job(name, commands)
+
+
+def _phase(later: Flags) -> list[str]:
+    flags = _flat(later)
+    phase = flags.pop("phase", None)
+    if phase not in ("zero-shot", "finetune"):
+        raise UsageError(
+            f"then.phase {printable(repr(phase))} is not valid; it must be zero-shot "
+            "or finetune."
+        )
+    return [str(phase), *_line(flags)]
+
+
+def _flat(flags: Mapping[str, Any], group: str = "") -> dict[str, Any]:
+    """Returns the flags of tables in tables."""
+    found: dict[str, Any] = {}
+    for name, value in flags.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{group}{name}.")
+        else:
+            found[group + name] = _checked(group + name, value)
+    return found
+
+
+def _checked(name: str, value: Any) -> Any:
+    try:
+        msgspec.convert(name, Annotated[str, _NAME])
+        return msgspec.convert(value, Plain | list[Plain])
+    except msgspec.ValidationError:
+        raise UsageError(
+            f"{printable(name)} = {printable(repr(value))} is not valid; it must be "
+            "the name of a flag without dashes, and text, a number, true or a list."
+        ) from None
+
+
+def _line(flags: Mapping[str, Any]) -> list[str]:
+    """Returns a command line; true is a flag without a value, false leaves it out."""
+    words: list[str] = []
+    for name, value in flags.items():
+        if value is False:
+            continue
+        values = value if isinstance(value, list) else [value]
+        words += [f"--{name}", *([] if value is True else map(str, values))]
+    return words
+
+
+def _words(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,263 @@
+"""`python -m experiments.sweep SWEEP.toml`: a grid of runs with all their phases."""
+
+import argparse
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from . import calling, cli, grid, robots, run, signals, status
+from .errors import (
+    CheckpointError,
+    InterruptedRun,
+    RunError,
+    UsageError,
+    last_line,
+    storage_errors,
+)
+from .grid import Job, Sweep
+from .storage import disk, rundir
+from .storage.status import COMPLETE, read
+
+_EPILOG = """
+A sweep is a file like this:
+
+  out = "runs/sweep"
+
+  [grid]                      # every combination is a run, called best-dmc-walker
+  arm = ["best", "random"]
+  env = ["dmc/cartpole", "dmc/walker"]
+
+  [flags]                     # of explore, for all runs; also what phase 2 starts from
+  preset = "laptop"
+  seeds = [0, 1, 2]
+  planner.horizon = 20
+
+  [[where]]                   # for some
+  grid.env = ["dmc/cartpole"]
+  flags.trial-length = 250
+
+  [[then]]                    # after exploration, in this order
+  phase = "zero-shot"
+
+  [[then]]
+  phase = "zero-shot"
+  tag = "longer"
+  task-planner.horizon = 30
+
+  [slurm]                     # of submitit, with --slurm
+  slurm_partition = "gpu"
+  timeout_min = 60
+
+What is complete is left out, what was stopped goes on: the same command continues."""
+_POLL = 0.5  # seconds
+
+
+class _Phases:
+    """One run, as a job of a cluster has it; it goes on when it was preempted."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self.command = list(command)
+
+    def __call__(self) -> int:
+        return subprocess.run(self.command, check=False).returncode
+
+    def checkpoint(self) -> Any:
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs what is left; returns the first exit code that is not 0."""
+    parser = argparse.ArgumentParser(
+        prog=calling.usage("sweep"),
+        description="Runs a grid of runs, each with all its phases.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("file", type=Path, metavar="SWEEP.toml")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N",
+        help="runs at a time; by default one for each GPU. Several share a GPU",
+    )  # fmt: skip
+    parser.add_argument("--only", default="", help="runs whose name has this in it")
+    parser.add_argument("--list", action="store_true", help="show the runs, start none")
+    parser.add_argument("--slurm", action="store_true", help="a job of SLURM each")
+    parser.add_argument("--run", help="this one, here; what the jobs call")
+    args = parser.parse_args(argv)
+    try:
+        sweep = grid.read(args.file)
+        jobs = [job for job in _named(sweep) if args.only in job.name]
+        if args.run is not None:
+            return _run(jobs, args.run)
+        with robots.without_gl():
+            left = _left(sweep, jobs)
+        print(f"{len(jobs)} runs, {len(jobs) - len(left)} of them complete", flush=True)
+        if args.list:
+            for job in jobs:
+                print(job.name, "left" if job in left else "complete", sep="  ")
+        if args.list or not left:
+            return 0
+        module = f"{__package__}.sweep"
+        command = [sys.executable, "-m", module, str(args.file), "--run"]
+        start = _on_slurm if args.slurm else _here
+        code = start(sweep, left, command, args.jobs)
+    except RunError as error:
+        signals.say(last_line(error))
+        return error.exit_code
+    status.main([sweep.out])
+    return code
+
+
+def _run(jobs: Sequence[Job], name: str) -> int:
+    """Runs the phases of one run until one does not end well."""
+    for job in jobs:
+        if job.name == name:
+            return next(filter(None, map(run.main, job.commands)), 0)
+    raise UsageError(f"--run {name} is not valid; there is no such run.")
+
+
+def _named(sweep: Sweep) -> list[Job]:
+    """Returns all runs; each must have a name of its own."""
+    jobs = list(grid.jobs(sweep))
+    if len({job.name for job in jobs}) < len(jobs):
+        raise UsageError("grid is not valid; two of its runs have one name.")
+    return jobs
+
+
+def _left(sweep: Sweep, jobs: Sequence[Job]) -> list[Job]:
+    """Returns the runs that are not complete; what is not valid is refused first."""
+    out = Path(sweep.out)
+    return [job for job in jobs if not _complete(out / job.name, job.commands)]
+
+
+def _complete(folder: Path, commands: Sequence[Sequence[str]]) -> bool:
+    explored = cli.parse(commands[0])
+    whole = _is_complete(folder, explored.num_trials)
+    for command in commands[1:]:
+        try:
+            config = cli.parse(command)
+        except CheckpointError:  # nothing is explored yet
+            whole = False
+        else:
+            step = config.at_trial or explored.num_trials
+            whole &= _is_complete(folder / cli.variant(config, step), None)
+    return whole
+
+
+def _is_complete(folder: Path, trial: int | None) -> bool:
+    if not (folder / rundir.STATUS).is_file():
+        return False
+    found = read(folder)
+    return found.state == COMPLETE and trial in (None, found.trial)
+
+
+def _here(
+    sweep: Sweep, left: Sequence[Job], command: Sequence[str], jobs: int | None
+) -> int:
+    """Runs several at a time on this machine, each on one of its GPUs."""
+    gpus = _gpus()
+    count = jobs or max(len(gpus), 1)
+    devices: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    for i in range(count):
+        devices.put(gpus[i % len(gpus)] if gpus else None)
+    shared = -(-count // len(gpus)) if gpus else 1
+    logs = Path(sweep.out) / "logs"
+    with storage_errors(f"use {logs}"):
+        disk.make(logs)
+    stop = threading.Event()
+
+    def one(job: Job) -> int:
+        if stop.is_set():
+            return InterruptedRun.exit_code
+        device = devices.get()
+        log, begin = logs / f"{job.name}.txt", time.monotonic()
+        with disk.opened(log, os.O_WRONLY | os.O_APPEND) as file:
+            process = subprocess.Popen(
+                [*command, job.name],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=_environment(device, shared),
+            )
+            while process.poll() is None:
+                if stop.wait(_POLL):
+                    process.send_signal(signal.SIGTERM)
+                    process.wait()
+        devices.put(device)
+        code = process.returncode
+        how = "complete" if code == 0 else f"exit code {code}, see {log}"
+        print(f"{job.name}: {how}  {time.monotonic() - begin:.0f} s", flush=True)
+        return code
+
+    with (
+        signals.first_signal(lambda number: stop.set()),
+        ThreadPoolExecutor(count) as pool,
+    ):
+        codes = list(pool.map(one, left))
+    return next(filter(None, codes), 0)
+
+
+def _environment(gpu: str | None, shared: int) -> dict[str, str]:
+    """Returns what a run sees of this machine: one GPU, or its share of one."""
+    found = dict(os.environ)
+    if gpu is not None:
+        found["CUDA_VISIBLE_DEVICES"] = gpu
+    if shared > 1:
+        found.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 / shared:.2f}")
+    return found
+
+
+def _gpus() -> list[str]:
+    """Returns the GPUs that runs may use; asking jax would take their memory."""
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if chosen is not None:
+        return [x for x in chosen.split(",") if x]
+    found = Path("/dev").glob("nvidia[0-9]*")
+    return sorted(path.name.removeprefix("nvidia") for path in found)
+
+
+def _on_slurm(
+    sweep: Sweep, left: Sequence[Job], command: Sequence[str], jobs: int | None,
+    cluster: str = "slurm",
+) -> int:  # fmt: skip
+    """Gives every run to SLURM, and waits; the runs need this process no more."""
+    try:
+        import submitit
+    except ImportError:
+        need = 'pip install "jaxpets[slurm]"'
+        raise UsageError(f"--slurm needs submitit; {need} brings it.") from None
+    try:
+        executor = submitit.AutoExecutor(Path(sweep.out) / "slurm", cluster=cluster)
+        executor.update_parameters(**sweep.slurm)
+        if jobs is not None:
+            executor.update_parameters(slurm_array_parallelism=jobs)
+    except (RuntimeError, NameError, TypeError, ValueError) as error:
+        raise UsageError(f"--slurm is not valid here: {error}") from error
+    with executor.batch():
+        started = [executor.submit(_Phases([*command, job.name])) for job in left]
+    codes = [_ended(job, task) for job, task in zip(left, started, strict=True)]
+    return next(filter(None, codes), 0)
+
+
+def _ended(job: Job, task: Any) -> int:
+    """Waits for a job of a cluster; returns the exit code of its run."""
+    try:
+        code = task.result()
+    except Exception as error:  # submitit's are of many kinds
+        print(f"{job.name}: {str(error).splitlines()[0]}", flush=True)
+        return 1
+    how = "complete" if code == 0 else f"exit code {code}, see {task.paths.stderr}"
+    print(f"{job.name}: {how}", flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    signals.as_program(main)

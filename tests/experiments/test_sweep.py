@@ -1,0 +1,194 @@
+"""A grid of runs: its file, its command lines, and the processes that run them."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from experiments import grid, sweep
+from experiments.grid import Job
+
+FILE = """
+out = "{out}"
+[grid]
+arm = ["random", "pink-noise"]
+[flags]
+preset = "smoke"
+engine = "mujoco"
+num-trials = 1
+model.num-members = 2
+planner.num-particles = 2
+task-planner.num-particles = 2
+training.bootstrap = false
+"""
+THEN = """
+[[where]]
+grid.arm = ["random"]
+flags.trial-length = 10
+flags.planner.no-fused = true
+[[then]]
+phase = "zero-shot"
+task = "forward"
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A function of the text of a sweep's file, which is below the test's folder."""
+
+    def written(text):
+        path = tmp_path / "sweep.toml"
+        path.write_text(text.replace("{out}", str(tmp_path / "runs")))
+        return path
+
+    return written
+
+
+def test_every_combination_is_a_run_with_its_flags(file, tmp_path):
+    random, pink = grid.jobs(grid.read(file(FILE + THEN)))
+    explore, perform = random.commands
+    own = ["--out", str(tmp_path / "runs"), "--name", "random"]
+    assert random.name == "random" and explore[:5] == ["explore", *own]
+    said = " ".join(explore)
+    assert "--preset smoke" in said and "--model.num-members 2" in said
+    assert "--trial-length 10 --planner.no-fused --arm random" in said
+    assert "bootstrap" not in said  # false
+    assert perform == ["zero-shot", *own, "--arm", "random", "--task", "forward"]
+    assert "--trial-length" not in pink.commands[0]
+
+
+def test_lists_are_words_and_the_last_entry_is_the_fastest(file):
+    text = 'out = "x"\n[grid]\nseeds = [[0, 1], 2]\nenv = ["dmc/a", "my/b.py:f"]'
+    jobs = list(grid.jobs(grid.read(file(text))))
+    assert [job.name for job in jobs] == ["0-1-dmc-a", "0-1-b-f", "2-dmc-a", "2-b-f"]
+    (explore,) = jobs[1].commands
+    assert " ".join(explore[3:]) == "--name 0-1-b-f --seeds 0 1 --env my/b.py:f"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "missing required field `out`"),
+        ("out =", "Invalid value"),
+        (FILE + "x = 1\n[other]\n", "unknown field `other`"),
+        (FILE.replace('["random", "pink-noise"]', "[]"), "length >= 1"),
+        (FILE.replace('["random", "pink-noise"]', "3"), "$.grid[...]"),
+        (FILE.replace("preset", '"pre set"'), "pre set = 'smoke' is not valid"),
+        (FILE.replace("num-trials = 1", "num-trials = 1e"), "sweep.toml is no sweep"),
+        (FILE.replace("num-trials = 1", "num-trials = 2020-01-01"), "num-trials"),
+        (FILE.replace("num-trials = 1", "num-trials = 0"), "--num-trials 0"),
+        (FILE.replace("num-trials", "num-trails"), "Perhaps --num-trials?"),
+        (FILE.replace("pink-noise", "random"), "two of its runs have one name"),
+        (FILE.replace('["random', '["../x/.py'), "--arm"),
+        (FILE + '[[then]]\nphase = "explore"', "then.phase 'explore'"),
+        (FILE + '[[then]]\nphase = "zero-shot"\neval-trials = 0', "--eval-trials 0"),
+    ],
+)
+def test_what_is_not_valid_is_refused_before_anything_runs(
+    file, tmp_path, capsys, text, words
+):
+    assert sweep.main([str(file(text))]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_does_not_keep_the_others(file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")
+    path, runs = file(FILE), tmp_path / "runs"
+    runs.mkdir()
+    (runs / "random").touch()  # where a folder should be
+    assert sweep.main([str(path), "--jobs", "2"]) == 5
+    said = capsys.readouterr().out
+    assert "random: exit code 5, see" in said and "pink-noise: complete" in said
+    assert "random" in (runs / "logs" / "random.txt").read_text()
+    assert sweep.main([str(path), "--list"]) == 0
+    assert "random  left\npink-noise  complete" in capsys.readouterr().out
+    assert sweep.main([str(path), "--only", "pink"]) == 0
+    assert capsys.readouterr().out == "1 runs, 1 of them complete\n"
+
+
+def test_a_run_has_its_phases_in_turn(file, monkeypatch, capsys):
+    calls = []
+    monkeypatch.setattr(sweep.run, "main", lambda argv: calls.append(argv[0]) or 4)
+    path = file(FILE + THEN)
+    assert sweep.main([str(path), "--run", "random"]) == 4
+    assert calls == ["explore"]
+    monkeypatch.setattr(sweep.run, "main", lambda argv: calls.append(argv[0]))
+    assert sweep.main([str(path), "--run", "random"]) == 0
+    assert calls == ["explore", "explore", "zero-shot"]
+    assert sweep.main([str(path), "--run", "x"]) == 2
+    assert "--run x is not valid" in capsys.readouterr().err
+
+
+SLEEPS = """
+import signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(75))
+open(sys.argv[1], "w").close()
+time.sleep(60)
+"""
+
+
+def test_a_signal_stops_those_that_run_and_starts_no_other(file, tmp_path):
+    """They end as a run that is interrupted does."""
+    table = grid.read(file(FILE))
+    left = [Job(str(tmp_path / name), []) for name in "abc"]
+
+    def stop():
+        while not (tmp_path / "a").exists():
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=stop).start()
+    command = [sys.executable, "-c", SLEEPS]
+    assert sweep._here(table, left, command, 1) == 75
+    assert not (tmp_path / "b").exists() and not (tmp_path / "c").exists()
+
+
+def test_runs_share_the_gpus(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_MEM_FRACTION", raising=False)
+    assert sweep._gpus() == ["2", "5"]
+    own = sweep._environment("5", 3)
+    assert own["CUDA_VISIBLE_DEVICES"] == "5"
+    assert own["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.30"
+    assert "XLA_PYTHON_CLIENT_MEM_FRACTION" not in sweep._environment("2", 1)
+
+
+ON_A_CLUSTER = """
+import sys
+from pathlib import Path
+import msgspec
+from experiments import grid, sweep
+from experiments.errors import UsageError
+from experiments.grid import Job
+table = grid.read(Path(sys.argv[1]))
+code = "import sys; sys.exit(3 * (sys.argv[1] == 'damaged'))"
+command, left = [sys.executable, "-c", code], [Job("fine", []), Job("damaged", [])]
+print(sweep._on_slurm(table, left, command, 2, cluster="local"))
+job = sweep._Phases(command)
+print(job.checkpoint().function.command == command)
+unknown = msgspec.structs.replace(table, slurm={"fly": 1})
+for wrong, cluster in ((table, "slurm"), (unknown, "local")):
+    try:
+        sweep._on_slurm(wrong, left, command, None, cluster)
+    except UsageError as error:
+        print(error)
+"""
+
+
+def test_a_cluster_runs_each_as_a_job(file):
+    """On submitit's cluster of one machine; it takes the handlers of logging away."""
+    path = file(FILE + "[slurm]\ntimeout_min = 2")
+    env = os.environ | {"PYTHONPATH": str(Path(grid.__file__).parents[1])}
+    command = [sys.executable, "-c", ON_A_CLUSTER, str(path)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    fine, damaged, code, same, slurm, fly = done.stdout.splitlines()
+    assert fine == "fine: complete" and damaged.startswith("damaged: exit code 3, see")
+    assert (code, same) == ("3", "True")
+    assert slurm.startswith("--slurm is not valid here:") and "srun" in slurm
+    assert fly.startswith("--slurm is not valid here:") and "fly" in fly
