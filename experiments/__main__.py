@@ -23,7 +23,7 @@ _OTHERS = {
     "sweep": "do a grid of runs, on this machine's GPUs or on SLURM",
     "status": "show what runs do, or how they ended",
     "compare": "show what differs between runs",
-    "play": "show a robot in the browser that does what is typed",
+    "play": "show a robot in the browser, which does what you type",
     "doctor": "say whether runs can start here, and what would help",
 }
 _ABOUT = f"""usage: {COMMAND} WORD [FLAG ...]
@@ -34,7 +34,7 @@ Unsupervised exploration with deep model-based RL, of any robot.
 
 {COMMAND} WORD --help       shows the flags of a word
 {COMMAND} --list envs       shows all robots
-{COMMAND} completion bash   prints what a shell completes them by; also zsh, fish"""
+{COMMAND} completion bash   prints the completion of a shell; also zsh, fish"""
 _SHELLS = ("bash", "zsh", "fish")
 
 

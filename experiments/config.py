@@ -89,10 +89,10 @@ class ModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """A fit: `training` and `tuning` after every trial, `refit` before phase 2."""
+    """A fit: `training` and `tuning` come after every trial, `refit` before phase 2."""
 
     num_epochs: Annotated[int, Meta(ge=0, le=10_000)] = FitConfig.num_epochs
-    """Passes over all data; refit: 0 goes on with the model as it was explored."""
+    """Passes over all data; a refit of 0 leaves the model as it explored."""
     batch_size: Annotated[int, Meta(ge=1, le=65_536)] = FitConfig.batch_size
     """Rows per member and gradient step."""
     learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
@@ -128,11 +128,11 @@ class PlannerConfig:
     temperature: Annotated[float, Meta(ge=1e-6, le=1e6)] = 1.0
     """mppi: 0.1 follows the few best candidates, 10 averages over all."""
     precision: Literal["f32", "tf32", "bf16"] = "bf16"
-    """Of the matrix products while planning, on CPUs with --planner.no-fused only;
-    training always uses tf32 or better."""
+    """Of the matrix products of a plan; on CPUs, of plans with no-fused.
+    Training always uses tf32 or better."""
     fused: bool = True
-    """Imagine in one kernel: on CPUs that have a C++ compiler, in float32 whatever the
-    precision, and with bf16 on GPUs that can (H100, H200)."""
+    """Imagine in one kernel, where there can be one: on CPUs with a C++ compiler,
+    which takes float32 whatever the precision; on an H100 or H200 with bf16."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +140,7 @@ class CriticConfig:
     """An actor and a critic of every task, which learn in imagination for zero-shot."""
 
     num_updates: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
-    """Gradient steps, at least; 0: a plan sees its horizon and nothing behind it."""
+    """Gradient steps, at least; 0: no critic, a plan ends with its horizon."""
     acts: bool = False
     """The actor acts alone: nothing is planned."""
     learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
@@ -150,7 +150,7 @@ class CriticConfig:
     batch_size: Annotated[int, Meta(ge=1, le=65_536)] = ActorCriticConfig.batch_size
     """Imagined rows per gradient step, at least."""
     horizon: Annotated[int, Meta(ge=1, le=1000)] = ActorCriticConfig.horizon
-    """Steps that they are imagined for in a gradient step."""
+    """Steps that are imagined in a gradient step."""
     discount: Annotated[float, Meta(ge=0.0, le=0.9999)] = 0.99
     """Per step of the environment, also of plans that end with the critic."""
     trace: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
@@ -180,20 +180,24 @@ class Basics:
     preset: Annotated[Preset, EXPLORED, COUNTED] = "laptop"
     """Numbers to start from: minutes on a laptop, the paper's, or seconds."""
     env: Annotated[str, EXPLORED, COUNTED] = HALF_CHEETAH
-    """The robot: a name (`--list envs` shows all), or FILE.py of your own with
-    `def robot(backend)`, FILE.py:NAME for another function."""
+    """The robot: a name of `--list envs`, or a file of your own,
+    FILE.py with `def robot(backend)` or FILE.py:NAME."""
     arm: Annotated[Arm, EXPLORED, COUNTED] = "epistemic"
-    """What exploration seeks: disagreement of the ensemble (epistemic, SU-PETS), rare
-    states (count), nothing (random), the first task (oracle), disagreement about
-    one-step, info-gain, disagreement in units of the data (best), or what other methods
-    seek: jensen-renyi (MAX), opax, ensemble-std (CEE-US), rnd, particle-entropy (APT);
-    the first task and disagreement (mixture), nothing, in pink-noise, or FILE.py:NAME,
-    an objective of your own."""
+    """What exploration seeks:
+    epistemic: disagreement of the ensemble (SU-PETS);
+    best: the same, in units of the data;
+    one-step: disagreement about one step;
+    info-gain: the information that a step gives;
+    count: rare states; oracle: the first task;
+    mixture: the first task and disagreement;
+    random, pink-noise: nothing;
+    jensen-renyi (MAX), opax, ensemble-std (CEE-US), rnd,
+    particle-entropy (APT): what other methods seek;
+    FILE.py:NAME: an objective of your own."""
     seeds: Annotated[tuple[Seed, ...], EXPLORED, COUNTED] = (0,)
     """One run each, side by side in one program; 0 to 2**32 - 1."""
     engine: EngineName = "mjx"
-    """What steps the physics: mjx on the device of the program, or mujoco, which is C
-    on the cores of the host."""
+    """What steps the physics: mjx on the program's device, mujoco in C on the host."""
     num_trials: Annotated[Trials, EXPLORED, COUNTED, GOAL] = 60
     """Exploration trials, the random ones included; a run may be given more later."""
 
@@ -224,7 +228,7 @@ class Evaluation:
     eval_trials: Annotated[TaskTrials, COUNTED] = 5
     """zero-shot: trials per task and seed."""
     pessimism: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
-    """Standard deviations between members taken off the reward of a task."""
+    """How many standard deviations between members a task's reward is lowered by."""
     refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
     task_planner: PlannerConfig = PlannerConfig()
     critic: CriticConfig = CriticConfig()
@@ -251,11 +255,9 @@ class Variant:
     task: str = "all"
     """The task to perform; by default all of the robot."""
     tasks: str | None = None
-    """FILE.py of your own with `def tasks()`: rewards by name, in place of the robot's
-    tasks."""
+    """FILE.py of your own: `def tasks()` gives rewards, in place of the robot's."""
     tag: str | None = None
-    """Name of a variant of phase 2, with other numbers: it has a folder of its own in
-    the run, and, if it is a zero-shot, a row of its own in the report."""
+    """Name of a variant of phase 2, with other numbers and its own folder."""
 
 
 @dataclasses.dataclass(frozen=True)

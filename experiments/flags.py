@@ -29,7 +29,7 @@ T = TypeVar("T")
 class Explore(Process, Compute, Science, Output, Basics):
     """Phase 1: learns a model, without a reward.
 
-    The numbers of phase 2 are kept for the commands that start from this run.
+    Flags of phase 2 are kept for the commands that start from this run.
     """
 
 
@@ -37,7 +37,7 @@ class Explore(Process, Compute, Science, Output, Basics):
 class ZeroShot(Process, Compute, Science, Origin, Variant, Output, Basics):
     """Phase 2: performs tasks with an explored model and learns nothing.
 
-    The numbers are those of the exploration run unless a flag says otherwise.
+    Settings are those of the exploration run unless a flag says otherwise.
     """
 
 
@@ -45,7 +45,7 @@ class ZeroShot(Process, Compute, Science, Origin, Variant, Output, Basics):
 class Finetune(ZeroShot):
     """Phase 2 goes on: learns from the trials of a task, too.
 
-    The numbers are those of the exploration run unless a flag says otherwise.
+    Settings are those of the exploration run unless a flag says otherwise.
     """
 
 
@@ -76,10 +76,10 @@ _ABOUT = """Unsupervised exploration with deep model-based RL, of any robot.
 
 The same command continues a run that was stopped.
 
-`explore` may be said as `--phase explore`, anywhere among the flags.
+`--phase explore`, anywhere among the flags, means the same as `explore`.
 
-These are the flags used most; `explore --help` has all numbers of a phase, and
-`--list envs` shows all robots."""
+These are the flags used most. `explore --help` shows all flags of a phase, and
+`--list envs` all robots."""
 
 
 def of(

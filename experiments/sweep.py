@@ -31,7 +31,7 @@ A sweep is a file like this:
 
   out = "runs/sweep"
 
-  [grid]                      # every combination is a run, called best-dmc-walker
+  [grid]                      # a run for each combination, as best-dmc-walker
   arm = ["best", "random"]
   env = ["dmc/cartpole", "dmc/walker"]
 
@@ -40,7 +40,7 @@ A sweep is a file like this:
   seeds = [0, 1, 2]
   planner.horizon = 20
 
-  [[where]]                   # for some
+  [[where]]                   # other flags for some of the runs
   grid.env = ["dmc/cartpole"]
   flags.trial-length = 250
 
@@ -56,7 +56,7 @@ A sweep is a file like this:
   slurm_partition = "gpu"
   timeout_min = 60
 
-What is complete is left out, what was stopped goes on: the same command continues."""
+The same command continues a sweep: it leaves out what is complete."""
 _POLL = 0.5  # seconds
 
 
@@ -83,15 +83,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("file", type=Path, metavar="SWEEP.toml")
+    parser.add_argument("file", type=Path, metavar="SWEEP.toml", help="as below")
     parser.add_argument(
         "--jobs", type=int, metavar="N",
-        help="runs at a time; by default one for each GPU. Several share a GPU",
+        help="runs at a time; by default one for each GPU. With more, runs share GPUs",
     )  # fmt: skip
-    parser.add_argument("--only", default="", help="runs whose name has this in it")
+    parser.add_argument("--only", default="", help="the runs whose name has this in it")
     parser.add_argument("--list", action="store_true", help="show the runs, start none")
-    parser.add_argument("--slurm", action="store_true", help="a job of SLURM each")
-    parser.add_argument("--run", help="this one, here; what the jobs call")
+    parser.add_argument("--slurm", action="store_true", help="run jobs of SLURM")
+    parser.add_argument("--run", help="do this run alone, here; jobs call it")
     args = parser.parse_args(argv)
     try:
         sweep = grid.read(args.file)

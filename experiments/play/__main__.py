@@ -12,8 +12,8 @@ from ..errors import ExitCode, InterruptedRun, RunError, UsageError
 
 _FROM = "pretrained/best"
 _EPILOG = """
-Ctrl-C ends it. Whoever is told the address may steer the robot: without --host that is
-this machine alone, and with it whoever has the token that is then in the address."""
+Ctrl-C ends it. Without --host only this machine can open the page. With it others can,
+if they have the token that is then in the address. Whoever sees the page may steer."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,10 +1,10 @@
 """`python -m experiments.tools.pretrained RUN NAME`: ships an explored model.
 
-Of a run are kept its config, environment and log, the model that performed in its last
-zero-shot, and config and environment of that: enough for `--phase zero-shot --from
-pretrained/NAME`, not to learn on. Tasks are planned with the numbers of the preset
-`laptop` and a longer horizon, a trial each, so that a laptop is enough; flags bring the
-run's own back.
+It keeps config, environment and log of a run, the model that performed in its last
+zero-shot, and config and environment of that: enough for `zero-shot --from
+pretrained/NAME`, but not to learn on. Each task is then one trial, planned with the
+numbers of the preset `laptop` and a longer horizon, so that a laptop is enough. Flags
+bring the run's own back.
 """
 
 import argparse
