@@ -45,8 +45,11 @@ def as_program(main: Callable[[], int]) -> NoReturn:
     with unheard():  # to the very end: threads of a failed save come last
         try:
             code = main()
+            sys.stdout.flush()
         except SystemExit as error:
             code = error.code
+        except BrokenPipeError:  # who reads has seen enough, as in `... --help | head`
+            code = 128 + signal.SIGPIPE
         except BaseException:
             traceback.print_exc()
         leave(code)

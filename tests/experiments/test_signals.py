@@ -91,6 +91,18 @@ def test_before_there_is_a_run_nothing_can_swallow_ctrl_c():
     assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGINT, "", "")
 
 
+def test_a_reader_who_has_seen_enough_is_no_bug():
+    """As in `... --help | head`; the exit code is that of a program in C."""
+    argv = [sys.executable, "-m", "experiments", "explore", "--help"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    found = subprocess.run(
+        argv, check=False, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, timeout=60
+    )
+    os.close(writer)
+    assert (found.returncode, found.stderr) == (128 + signal.SIGPIPE, b"")
+
+
 def test_what_a_stopped_run_holds_is_not_freed():
     argv = [sys.executable, "-c", textwrap.dedent(HELD), "explore"]
     found = subprocess.run(
