@@ -10,6 +10,7 @@ from .config import (
     Basics,
     Compute,
     Config,
+    CriticConfig,
     Phase,
     Phased,
     Process,
@@ -33,11 +34,15 @@ from .validate import (
 PRETRAINED = Path(__file__).with_name("pretrained")
 
 
-def parse(argv: Sequence[str]) -> Config:
+def parse(argv: Sequence[str], source: Config | None = None) -> Config:
     """Returns the validated Config of a command line.
 
     zero-shot and finetune take their defaults from the run they start from, so that a
     preset or a number need not be said twice.
+
+    Args:
+      argv: the command line.
+      source: explores what they start from, where that is not there yet.
 
     Raises:
       UsageError: with one line for the user.
@@ -47,7 +52,9 @@ def parse(argv: Sequence[str]) -> Config:
     phase, rest = _phase(argv)
     config = _config(phase, rest, _preset(rest))  # what is wrong comes before the run
     if phase in ("zero-shot", "finetune"):
-        explored = _explored(config)
+        explored = _numbers(source) if source else _explored(config)
+        if phase == "finetune":  # which has none; what zero-shot had is not its own
+            explored = dataclasses.replace(explored, critic=CriticConfig())
         config = _config(phase, rest, explored)
         check_explored(config, explored)
         _check_pretrained(config)
@@ -161,6 +168,10 @@ def _explored(config: Config) -> Config:
     for entry in ("env", "arm"):
         said, found = getattr(config, entry), getattr(explored, entry)
         user_files.check_named(flag(entry), said, found, path)
+    return _numbers(explored)
+
+
+def _numbers(explored: Config) -> Config:
     return Config(**vars(part(explored, Science)), **vars(part(explored, Compute)))
 
 

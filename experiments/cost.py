@@ -72,16 +72,20 @@ def check_cpu(config: Config) -> None:
 def memory_advice(config: Config) -> str:
     """Returns what is planned at once, and with which flags it would be less."""
     group, search = _search(config)
-    trials = _num_tasks(config)
-    flags = ["--seeds", f"--{group}.num-samples", f"--{group}.num-particles"]
+    seeds, trials = len(config.seeds), _num_tasks(config)
+    flags = [f"--{group}.num-samples", f"--{group}.num-particles"]
+    learned = ""
     if config.phase == "zero-shot":
+        if config.critic.num_updates:
+            learned = f"{seeds} seeds x {trials} critics learn at once, and "
+            flags = ["--critic.batch-size", *flags[: 2 * (not config.critic.acts)]]
         trials *= config.eval_trials
-        flags.insert(1, "--eval-trials")
+        flags.insert(0, "--eval-trials")
     return (
-        f"out of memory. {len(config.seeds)} seeds x {trials} trials x "
+        f"out of memory. {learned}{seeds} seeds x {trials} trials x "
         f"{search.num_samples} samples x {search.num_particles} particles x horizon "
-        f"{search.horizon} are planned at once; lower one of {', '.join(flags)}. The "
-        "last checkpoint is intact."
+        f"{search.horizon} are planned at once; lower one of "
+        f"{', '.join(['--seeds', *flags])}. The last checkpoint is intact."
     )
 
 

@@ -75,7 +75,7 @@ def jobs(sweep: Sweep) -> Iterator[Job]:
         own = ["--out", sweep.out, "--name", name]
         commands = [["explore", *own, *_line(flags)]]
         # A user's file has to be named again, since no run's config may name one.
-        own += _line({x: place[x] for x in ("env", "arm") if x in place})
+        own += _line({x: flags[x] for x in ("env", "arm") if x in flags})
         for later in sweep.then:
             phase, *rest = _phase(later)
             commands.append([phase, *own, *rest])
@@ -116,13 +116,15 @@ def _checked(name: str, value: Any) -> Any:
 
 
 def _line(flags: Mapping[str, Any]) -> list[str]:
-    """Returns a command line; true is a flag without a value, false leaves it out."""
+    """Returns a command line; true is a flag without a value, false its opposite."""
     words: list[str] = []
     for name, value in flags.items():
-        if value is False:
+        if isinstance(value, bool):
+            group, dot, last = name.rpartition(".")
+            words.append(f"--{name}" if value else f"--{group}{dot}no-{last}")
             continue
         values = value if isinstance(value, list) else [value]
-        words += [f"--{name}", *([] if value is True else map(str, values))]
+        words += [f"--{name}", *map(str, values)]
     return words
 
 

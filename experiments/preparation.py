@@ -110,12 +110,14 @@ def _learned(
     keys, now = acting.split_keys(keys)
     learned = init(params, now, dataset)
     count, updates = critic.calls(config)
+    skipped: Any = 0
     for _ in range(count):
         keys, now = acting.split_keys(keys)
         learned, metrics = learn(params, now, learned, dataset)
         jax.block_until_ready(learned)
-    value, networks = devices.collect(
-        placement, (metrics.value, learned.params), SEED, TASK
+        skipped += metrics.num_skipped
+    value, skipped, networks = devices.collect(
+        placement, (metrics.value, skipped, learned.params), SEED, TASK
     )
     earned = jnp.mean(value) * (1 - config.critic.discount)
     seconds = time.monotonic() - begin
@@ -123,4 +125,8 @@ def _learned(
         f"critic: {count * updates:,} gradient steps for each task; the actors expect "
         f"{earned:.3f} a step  {seconds:.1f} s"
     )
+    if lost := int(jnp.sum(skipped)):
+        run.say(
+            f"warning: {lost:,} gradient steps of critics were not finite: left out"
+        )
     return networks

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from . import calling, cli, grid, robots, run, signals, status
+from .config import Config
+from .entries import differences, to_json
 from .errors import (
     CheckpointError,
     InterruptedRun,
@@ -67,7 +69,11 @@ class _Phases:
         self.command = list(command)
 
     def __call__(self) -> int:
-        return subprocess.run(self.command, check=False).returncode
+        with subprocess.Popen(self.command) as process:
+            try:
+                return process.wait()
+            finally:
+                process.terminate()  # if submitit leaves first: it stops as it should
 
     def checkpoint(self) -> Any:
         from submitit.helpers import DelayedSubmission
@@ -93,6 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--slurm", action="store_true", help="run jobs of SLURM")
     parser.add_argument("--run", help="do this run alone, here; jobs call it")
     args = parser.parse_args(argv)
+    if args.jobs is not None and args.jobs < 1:
+        parser.error(f"--jobs {args.jobs} is not valid; it must be 1 or more.")
     try:
         sweep = grid.read(args.file)
         jobs = [job for job in _named(sweep) if args.only in job.name]
@@ -141,21 +149,25 @@ def _left(sweep: Sweep, jobs: Sequence[Job]) -> list[Job]:
 
 def _complete(folder: Path, commands: Sequence[Sequence[str]]) -> bool:
     explored = cli.parse(commands[0])
-    whole = _is_complete(folder, explored.num_trials)
+    whole = _is_complete(folder, explored, explored.num_trials)
     for command in commands[1:]:
         try:
             config = cli.parse(command)
         except CheckpointError:  # nothing is explored yet
+            cli.parse(command, explored)
             whole = False
         else:
-            step = config.at_trial or explored.num_trials
-            whole &= _is_complete(folder / cli.variant(config, step), None)
+            step = explored.num_trials if config.at_trial is None else config.at_trial
+            whole &= _is_complete(folder / cli.variant(config, step), config, None)
     return whole
 
 
-def _is_complete(folder: Path, trial: int | None) -> bool:
+def _is_complete(folder: Path, config: Config, trial: int | None) -> bool:
     if not (folder / rundir.STATUS).is_file():
         return False
+    began = rundir.find_json(folder / rundir.CONFIG)
+    if differences(began, to_json(config), str(folder / rundir.CONFIG)):
+        return False  # the run itself refuses, and says what differs
     found = read(folder)
     return found.state == COMPLETE and trial in (None, found.trial)
 
@@ -178,24 +190,35 @@ def _here(
     def one(job: Job) -> int:
         if stop.is_set():
             return InterruptedRun.exit_code
-        device = devices.get()
-        log, begin = logs / f"{job.name}.txt", time.monotonic()
+        device, begin = devices.get(), time.monotonic()
+        log = logs / f"{job.name}.txt"
+        try:
+            with storage_errors(f"start {job.name}"):
+                code = started(job, log, device)
+        except RunError as error:  # of this one; the others go on
+            print(f"{job.name}: {error}", flush=True)
+            return error.exit_code
+        finally:
+            devices.put(device)
+        how = "complete" if code == 0 else f"exit code {code}, see {log}"
+        print(f"{job.name}: {how}  {time.monotonic() - begin:.0f} s", flush=True)
+        return code
+
+    def started(job: Job, log: Path, device: str | None) -> int:
         with disk.opened(log, os.O_WRONLY | os.O_APPEND) as file:
             process = subprocess.Popen(
                 [*command, job.name],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=_environment(device, shared),
+                # A terminal's Ctrl-C would be a second signal, which ends it at once.
+                start_new_session=True,
             )
             while process.poll() is None:
                 if stop.wait(_POLL):
                     process.send_signal(signal.SIGTERM)
                     process.wait()
-        devices.put(device)
-        code = process.returncode
-        how = "complete" if code == 0 else f"exit code {code}, see {log}"
-        print(f"{job.name}: {how}  {time.monotonic() - begin:.0f} s", flush=True)
-        return code
+        return process.returncode
 
     with (
         signals.first_signal(lambda number: stop.set()),
@@ -220,8 +243,8 @@ def _gpus() -> list[str]:
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:
         return [x for x in chosen.split(",") if x]
-    found = Path("/dev").glob("nvidia[0-9]*")
-    return sorted(path.name.removeprefix("nvidia") for path in found)
+    # CUDA counts from 0 what a container has, whatever the files are called.
+    return [str(i) for i, _ in enumerate(Path("/dev").glob("nvidia[0-9]*"))]
 
 
 def _on_slurm(
@@ -241,8 +264,11 @@ def _on_slurm(
             executor.update_parameters(slurm_array_parallelism=jobs)
     except (RuntimeError, NameError, TypeError, ValueError) as error:
         raise UsageError(f"--slurm is not valid here: {error}") from error
-    with executor.batch():
-        started = [executor.submit(_Phases([*command, job.name])) for job in left]
+    try:
+        with executor.batch():
+            started = [executor.submit(_Phases([*command, job.name])) for job in left]
+    except (RuntimeError, OSError) as error:  # as sbatch says it
+        raise UsageError(f"SLURM took no job: {error}") from error
     codes = [_ended(job, task) for job, task in zip(left, started, strict=True)]
     return next(filter(None, codes), 0)
 

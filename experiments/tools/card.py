@@ -164,7 +164,7 @@ def _front_matter(facts: _Facts) -> str:
     licence = str(facts.about["licence"]).lower()
     lines = [_HEAD.format(licence=licence, name=json.dumps(facts.file.stem))]
     for found in facts.performed:
-        how = f"mean return; {_search(found.config.task_planner)}; {found.device}"
+        how = f"mean return; {_performing(found.config)}; {found.device}"
         robot = json.dumps(facts.about["environment"])
         for task, values in found.returns.items():
             words = {"task": json.dumps(task), "robot": robot, "how": json.dumps(how)}
@@ -236,12 +236,16 @@ def _fit(fit: Mapping[str, Any]) -> str:
     )
 
 
+def _performing(config: Config) -> str:
+    said, updates = _search(config.task_planner), config.critic.num_updates
+    said = "an actor, no search" if config.critic.acts else said
+    return f"{said}, critic of {updates:,} imagined steps" if updates else said
+
+
 def _search(search: PlannerConfig) -> str:
-    return (
-        f"{search.optimizer} with {search.num_samples} candidates, "
-        f"{search.num_iterations} iterations, {search.num_particles} particles and "
-        f"horizon {search.horizon}"
-    )
+    found = f"{search.optimizer} with {search.num_samples} candidates, "
+    found += f"{search.num_iterations} iterations, {search.num_particles} particles"
+    return f"{found} and horizon {search.horizon}"
 
 
 def _device(environment: Mapping[str, Any]) -> str:
@@ -258,8 +262,8 @@ def _returned(facts: _Facts) -> Iterator[str]:
         "of the mean over trials of this one model; other seeds return something else."
     )
     for found in facts.performed:
-        search, length = _search(found.config.task_planner), found.config.task_length
-        yield f"{found.device}; {search}; trials of {length:,} steps:"
+        how, length = _performing(found.config), found.config.task_length
+        yield f"{found.device}; {how}; trials of {length:,} steps:"
         lines = ["| task | mean return | trials |", "|---|---|---|"]
         for task, values in found.returns.items():
             mean, interval = f"{values.mean():.0f}", stats.t_interval(values)

@@ -46,7 +46,7 @@ def build_update(
         first, second = networks.judge(state.targets, seen, action)
         after = (first + second) / 2 - config.pessimism * jnp.abs(first - second) / 2
         returns = lambda_returns(
-            params.scale * steps.reward, after, steps.goes_on,
+            params.scale * steps.reward, after, steps.goes_on, steps.counts,
             discount=config.discount, trace=config.trace,
         )  # fmt: skip
         bound = params.scale / (1.0 - config.discount)
@@ -107,6 +107,7 @@ def lambda_returns(
     reward: Array,
     after: Array,
     goes_on: Array,
+    counts: Array,
     *,
     discount: float | Array,
     trace: float | Array,
@@ -120,16 +121,18 @@ def lambda_returns(
       reward: `[K, ...]`.
       after: `[K, ...]`, V.
       goes_on: `[K, ...]` bool, whether the trial does.
+      counts: `[K, ...]` bool; of a step that does not, nothing but V is read.
       discount: per step.
       trace: lambda.
     """
 
-    def back(later: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        reward, after, goes_on = step
+    def back(later: Array, step: tuple[Array, ...]) -> tuple[Array, Array]:
+        reward, after, goes_on, counts = step
         mixed = (1.0 - trace) * after + trace * later
         found = reward + discount * jnp.where(goes_on, mixed, 0.0)
-        return found, found
+        # A step that is not finite stays where it was: V is what follows from there.
+        return jnp.where(counts, found, after), found
 
-    steps = (reward, after, goes_on)
+    steps = (reward, after, goes_on, counts)
     _, returns = jax.lax.scan(back, after[-1], steps, reverse=True)
     return returns

@@ -4,10 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import threading
+import time
 from pathlib import Path
 
 import pytest
+import runs
 
 from experiments import grid, sweep
 from experiments.grid import Job
@@ -56,7 +57,7 @@ def test_every_combination_is_a_run_with_its_flags(file, tmp_path):
     said = " ".join(explore)
     assert "--preset smoke" in said and "--model.num-members 2" in said
     assert "--trial-length 10 --planner.no-fused --arm random" in said
-    assert "bootstrap" not in said  # false
+    assert "--training.no-bootstrap" in said
     assert perform == ["zero-shot", *own, "--arm", "random", "--task", "forward"]
     assert "--trial-length" not in pink.commands[0]
 
@@ -133,20 +134,96 @@ time.sleep(60)
 """
 
 
-def test_a_signal_stops_those_that_run_and_starts_no_other(file, tmp_path):
-    """They end as a run that is interrupted does."""
+HERE = """
+import sys
+from pathlib import Path
+from experiments import grid, sweep
+from experiments.grid import Job
+table, folder = grid.read(Path(sys.argv[1])), Path(sys.argv[2])
+left = [Job(str(folder / name), []) for name in "abc"]
+sys.exit(sweep._here(table, left, [sys.executable, "-c", sys.argv[3]], 1))
+"""
+
+
+@pytest.mark.parametrize("whom", [os.kill, os.killpg], ids=["sweep", "terminal"])
+def test_a_signal_stops_those_that_run_and_starts_no_other(file, tmp_path, whom):
+    """They end as a run that is interrupted does; a terminal signals all of a group."""
+    own = tmp_path / "started"
+    own.mkdir()
+    env = os.environ | {"PYTHONPATH": str(Path(grid.__file__).parents[1])}
+    arguments = ["-c", HERE, str(file(FILE)), str(own), SLEEPS]
+    process = subprocess.Popen(
+        [sys.executable, *arguments], env=env, start_new_session=True,
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while not (own / "a").exists() and process.poll() is None:
+        time.sleep(0.05)
+    whom(process.pid, signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 75 and "exit code 75, see" in said
+    assert not (own / "b").exists() and not (own / "c").exists()
+
+
+def test_a_run_that_cannot_be_started_does_not_keep_the_others(file, tmp_path, capsys):
     table = grid.read(file(FILE))
-    left = [Job(str(tmp_path / name), []) for name in "abc"]
+    logs = tmp_path / "runs" / "logs"
+    (logs / "bad.txt").mkdir(parents=True)
+    left = [Job(name, []) for name in ("bad", "good")]
+    assert sweep._here(table, left, [sys.executable, "-c", ""], 1) == 5
+    said = capsys.readouterr().out
+    assert "bad.txt" in said and "good: complete" in said
+    missing = [str(tmp_path / "missing")]
+    assert sweep._here(table, left[1:], missing, 1) == 5
+    assert "cannot start good" in capsys.readouterr().out
 
-    def stop():
-        while not (tmp_path / "a").exists():
-            pass
-        os.kill(os.getpid(), signal.SIGTERM)
 
-    threading.Thread(target=stop).start()
-    command = [sys.executable, "-c", SLEEPS]
-    assert sweep._here(table, left, command, 1) == 75
-    assert not (tmp_path / "b").exists() and not (tmp_path / "c").exists()
+DONE = """
+out = "{out}"
+[grid]
+arm = ["epistemic"]
+[flags]
+preset = "smoke"
+engine = "mujoco"
+[[then]]
+phase = "zero-shot"
+refit.num-epochs = 1
+refit.batch-size = 16
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("old", "new", "state"),
+    [
+        ("", "", "complete"),
+        ("smoke", "smoke", "complete"),
+        ("[[then]]", "num-trials = 2\n[[then]]", "left"),
+        ("[[then]]", "training.batch-size = 9\n[[then]]", "left"),
+        ("num-epochs = 1", "num-epochs = 2", "left"),
+        ("[[then]]", '[[then]]\nphase = "zero-shot"\ntag = "more"\n[[then]]', "left"),
+        ("[[then]]", "[[then]]\nat-trial = 0", "left"),
+    ],
+)
+def test_a_run_is_complete_if_it_is_what_the_file_says(
+    performed_once, file, tmp_path, capsys, old, new, state
+):
+    runs.copied(performed_once, tmp_path / "copy")
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "copy" / performed_once.name).rename(tmp_path / "runs" / "epistemic")
+    assert sweep.main([str(file(DONE.replace(old, new, 1))), "--list"]) == 0
+    assert f"epistemic  {state}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('task = "forwrd"', "--task forwrd is not valid"),
+        ("critic.acts = true", "--critic.acts"),
+    ],
+)
+def test_what_comes_later_is_refused_at_once(file, capsys, line, words):
+    assert sweep.main([str(file(DONE + line)), "--list"]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_runs_share_the_gpus(monkeypatch):

@@ -147,11 +147,13 @@ def test_returns_equal_the_recursion_by_hand():
     rng = np.random.default_rng(1)
     reward, after = rng.normal(size=(2, 4, 3)).astype(np.float32)
     goes_on = rng.uniform(size=(4, 3)) < 0.7
-    got = lambda_returns(reward, after, goes_on, discount=0.9, trace=0.3)
+    counts = rng.uniform(size=(4, 3)) < 0.7
+    got = lambda_returns(reward, after, goes_on, counts, discount=0.9, trace=0.3)
     later = after[-1]
     for t in reversed(range(4)):
         later = reward[t] + 0.9 * goes_on[t] * (0.7 * after[t] + 0.3 * later)
         np.testing.assert_allclose(got[t], later, rtol=1e-5)
+        later = np.where(counts[t], later, after[t])
 
 
 def test_imagined_trials_end_and_stay():
@@ -226,6 +228,78 @@ def test_rows_that_blow_up_teach_nothing():
     learned = learn("broken world")
     assert learned.metrics.num_skipped == 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(learned.after.params))
+
+
+PLAIN = dict(num_updates=1, target_rate=0.0, num_members=2, optimizer=optax.sgd(0.1))
+
+
+def one_update(task, state=None, targets=1.0, pessimism=0.0, restart=0.0):
+    """One gradient step of a learner with two members; also what it began with."""
+    known = PlanParams(WORLD, Task(*map(jnp.float32, task)))
+    if state is None:
+        state = INIT_PLAIN(known, jax.random.key(0), states())
+    large = jax.tree.map(lambda x: targets * x, state.targets)
+    begun = state._replace(targets=large)
+    key, numbers = jax.random.key(1), jnp.array([pessimism, restart], jnp.float32)
+    return begun, STEP_PLAIN(numbers, known, key, begun, states())[0]
+
+
+def step_plain(numbers, *arguments):
+    return build(pessimism=numbers[0], restart=numbers[1], **PLAIN).step(*arguments)
+
+
+INIT_PLAIN = jax.jit(build(**PLAIN).init)
+STEP_PLAIN = jax.jit(step_plain)
+
+
+def biases(state):
+    """The last biases of the critics, which go where their targets are on average."""
+    leaves = jax.tree.leaves_with_path(state.params.critics)
+    (found,) = [x for path, x in leaves if x.shape[1:] == (1,)]
+    return np.asarray(found)
+
+
+def test_no_value_is_beyond_the_rewards():
+    """Once it is, it does not matter how far."""
+    ends = [one_update(TASKS["two"], targets=scale)[1] for scale in (1e4, 1e6)]
+    assert (biases(ends[0]) == biases(ends[1])).all()
+    _, near = one_update(TASKS["two"], targets=1.0)
+    assert (biases(near) != biases(ends[0])).all()
+
+
+def test_pessimism_takes_the_lesser_of_the_critics():
+    least, mean, between = (
+        biases(one_update(TASKS["far"], pessimism=x)[1]) for x in (1.0, 0.0, 0.5)
+    )
+    assert (least < between).all() and (between < mean).all()
+
+
+def test_half_of_the_trials_go_on():
+    """The others begin in states of the data, with a reward of their own."""
+    before, after = one_update(TASKS["anywhere"])
+    rows = {tuple(row) for row in np.asarray(states().data.obs)}
+    known = np.array([[tuple(x) in rows for x in xs] for xs in np.asarray(after.obs)])
+    half = known.shape[1] // 2
+    assert known.shape == (2, 8) and known[:, :half].all() and not known[:, half:].any()
+    same = np.asarray(after.rewards.place == before.rewards.place)
+    assert same[:, half:].all() and not same[:, :half].any()
+    for task, restart in ((TASKS["anywhere"], 1.0), (TASKS["short"], 0.0)):
+        _, renewed = one_update(task, restart=restart)
+        assert all(tuple(x) in rows for x in np.asarray(renewed.obs).reshape(-1, 2))
+
+
+def test_tasks_at_once_are_those_alone():
+    tasks = [Task(*map(jnp.float32, TASKS[name])) for name in ("far", "anywhere")]
+    alone = [one_update(task) for task in tasks]
+    stack = functools.partial(jax.tree.map, lambda *x: jnp.stack(x))
+    params = PlanParams(WORLD, stack(*tasks))
+    takes = (None, PlanParams(None, 0), None, 0, None)
+    together, _ = jax.jit(jax.vmap(step_plain, takes))(
+        jnp.zeros(2), params, jax.random.key(1), stack(*(x for x, _ in alone)), states()
+    )
+    wanted = stack(*(x for _, x in alone))
+    for got, want in zip(*map(jax.tree.leaves, (together, wanted)), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
 
 
 def test_steps_that_are_not_finite_are_dropped():
