@@ -11,6 +11,7 @@ from .. import calling, robots, signals
 from ..errors import ExitCode, InterruptedRun, RunError, UsageError
 
 _FROM = "pretrained/best"
+_LONGEST = 1000  # horizon
 _EPILOG = """
 Ctrl-C ends it. Without --host only this machine can open the page. With it others can,
 if they have the token that is then in the address. Whoever sees the page may steer."""
@@ -79,6 +80,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--env", help="the robot; by default that of the model")
     add("--seed", type=int, help="of a run with several; by default the first")
     add(
+        "--horizon", type=_steps, metavar="STEPS",
+        help="planned ahead, by default as the model says; fewer are quicker",
+    )  # fmt: skip
+    add(
         "--watch", type=Path, metavar="RUN",
         help="shows the last trial of a run, and its curves, while it explores",
     )  # fmt: skip
@@ -86,6 +91,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--host", help="to listen at, as 0.0.0.0; by default this machine alone")
     add("--debug", action="store_true", help="shows tracebacks")
     return parser
+
+
+def _steps(text: str) -> int:
+    if not 1 <= int(text) <= _LONGEST:
+        raise argparse.ArgumentTypeError(f"{text} is not 1 to {_LONGEST}")
+    return int(text)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Puts a page together and keeps it up."""
 
+import dataclasses
 import os
 import secrets
 import socket
@@ -31,6 +32,7 @@ class Options(NamedTuple):
     source: str
     env: str | None = None
     seed: int | None = None
+    horizon: int | None = None
     watch: Path | None = None
     port: int | None = None
     host: str | None = None
@@ -71,10 +73,11 @@ def serve(
 def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     """Returns the page of a robot that plans."""
     found = source.found(options.source, env=options.env, seed=options.seed)
-    robot, horizon = found.robot, found.search.horizon
-    rollout, _ = build.rollout_of(robot, found.size, found.search)
+    robot, horizon = found.robot, options.horizon or found.search.horizon
+    search = dataclasses.replace(found.search, horizon=horizon)
+    rollout, _ = build.rollout_of(robot, found.size, search)
     live = Live(
-        robot, rollout, build.optimizer(found.search, robot.env), found.params,
+        robot, rollout, build.optimizer(search, robot.env), found.params,
         horizon=horizon, terminal_fn=build.imagined_end(robot.env),
     )  # fmt: skip
     commands = command.Commands(robot, found.params)

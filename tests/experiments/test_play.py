@@ -19,6 +19,7 @@ import pytest
 import runs
 
 import jaxpets
+from experiments import build
 from experiments.errors import CheckpointError, InterruptedRun, UsageError
 from experiments.play import __main__ as command_line
 from experiments.play.clock import Clock
@@ -545,16 +546,21 @@ class Visitor:
 def visitor(monkeypatch):
     """Somebody who looks at a page on which little is planned."""
     found = source.found("pretrained/best")
-    sizes = {"horizon": 4, "num_samples": 8, "num_elites": 2, "num_iterations": 2}
+    sizes = {"num_samples": 8, "num_elites": 2, "num_iterations": 2}
     small = found._replace(search=dataclasses.replace(found.search, **sizes))
     monkeypatch.setattr(source, "found", lambda *_, **__: small)
     told, is_over = queue.Queue(), threading.Event()
-    options = serve.Options("pretrained/best", port=0, host="127.0.0.1")
+    options = serve.Options("pretrained/best", horizon=4, port=0, host="127.0.0.1")
+    planned, search_of = [], build.optimizer
+    monkeypatch.setattr(
+        build, "optimizer", lambda *x: planned.append(x[0].horizon) or search_of(*x)
+    )
     args = (options, is_over, told.put)
     thread = threading.Thread(target=serve.serve, args=args, kwargs={"rate": 10.0})
     thread.start()
     visitor = Visitor(told.get(timeout=60))
     yield visitor
+    assert planned == [4]
     visitor.socket.close()
     is_over.set()
     thread.join(60)
@@ -611,6 +617,13 @@ def test_without_viser_one_line_says_what_is_missing(capsys, monkeypatch):
     assert code == UsageError.exit_code
     need = 'pip install "jaxpets[play]" brings it.'
     assert line == f"error: viser is not installed; {need}"
+
+
+@pytest.mark.parametrize("steps", ["0", "1001", "x"])
+def test_a_horizon_is_a_number_of_steps(capsys, steps):
+    with pytest.raises(SystemExit):
+        command_line.main(["--horizon", steps])
+    assert "argument --horizon" in capsys.readouterr().err
 
 
 def test_what_is_wrong_is_a_line(capsys, tmp_path):
