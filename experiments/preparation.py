@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 from jax.sharding import PartitionSpec as P
 
 import jaxpets
@@ -23,7 +24,11 @@ from .parallel.devices import SEED, TASK
 from .refit import refit
 from .storage.folder import RunFolder
 
-_AXES = jaxpets.SEED_AXES.dataset
+# Which axes seeds and tasks have: of PlanParams, of data, and of all else.
+_KNOWN = jaxpets.PlanParams(P(SEED), P(TASK))
+# The size of the data is one number, for all seeds.
+_DATA = jaxpets.datasets.AXES._replace(data=P(SEED), size=P(), cursor=P())
+_EVERY = P(SEED, TASK)
 
 
 def prepared(
@@ -65,16 +70,13 @@ def template(config: Config, parts: Parts, tasks: Tasks) -> State:
     model = exploration.model_of(explored)
     if parts.critic is None:
         return model
-    init = parts.critic.init
-
-    def one(params: Any, task: Any, dataset: Any) -> ActorCriticParams:
-        known = jaxpets.PlanParams(params, task)
-        return init(known, jax.random.key(0), dataset).params
-
-    of_tasks = jax.vmap(one, (None, 0, None))
-    of_seeds = jax.vmap(of_tasks, (0, None, _AXES))
-    networks = jax.eval_shape(of_seeds, explored.params, tasks.params, explored.dataset)
-    return model._replace(reward=networks)
+    begun = jax.eval_shape(
+        _mapped(parts.critic.init, (_KNOWN, _EVERY, _DATA)),
+        jaxpets.PlanParams(explored.params, tasks.params),
+        _keys(config, parts, tasks, 0),
+        explored.dataset,
+    )
+    return model._replace(reward=begun.params)
 
 
 def _learned(
@@ -83,25 +85,22 @@ def _learned(
     """Returns the networks `[S, K]` of every seed and task."""
     assert parts.critic is not None
     placement = devices.spread(len(config.seeds), len(tasks.names))
-    every, of_seed = P(SEED, TASK), P(SEED)
-    known = jaxpets.PlanParams(of_seed, P(TASK))
-    # The size of the data is one number, for all seeds.
-    data = _AXES._replace(data=of_seed, size=P(), cursor=P())
 
-    def mapped(function: Any, takes: tuple[Any, ...], gives: Any) -> Any:
-        for axis in (TASK, SEED):
-            function = acting.over(function, takes, axis)
-        return devices.split(placement, function, takes, gives)
+    def program(
+        function: Any, takes: tuple[Any, ...], gives: Any, **options: Any
+    ) -> Any:
+        split = devices.split(placement, _mapped(function, takes), takes, gives)
+        return jax.jit(split, **options)
 
-    init = mapped(parts.critic.init, (known, every, data), every)
-    step_takes = (known, every, every, data)
-    learn = mapped(parts.critic.step, step_takes, (every, every))
-    init, learn = jax.jit(init), jax.jit(learn, donate_argnums=2)
-
+    init = program(parts.critic.init, (_KNOWN, _EVERY, _DATA), _EVERY)
+    learn = program(
+        parts.critic.step,
+        (_KNOWN, _EVERY, _EVERY, _DATA),
+        (_EVERY, _EVERY),
+        donate_argnums=2,
+    )
     begin = time.monotonic()
-    keys = trial_keys(config, CRITIC, step)
-    keys = key_per(robots.places(parts.robot, tasks), keys)
-    keys = devices.place(placement, keys, SEED, TASK)
+    keys = devices.place(placement, _keys(config, parts, tasks, step), SEED, TASK)
     params = jaxpets.PlanParams(
         devices.place(placement, state.params, SEED),
         devices.place(placement, tasks.params, TASK),
@@ -130,3 +129,16 @@ def _learned(
             f"warning: {lost:,} gradient steps of critics were not finite: left out"
         )
     return networks
+
+
+def _mapped(function: Any, takes: tuple[Any, ...]) -> Any:
+    """Maps what one seed's task takes over tasks, then over seeds."""
+    for axis in (TASK, SEED):
+        function = acting.over(function, takes, axis)
+    return function
+
+
+def _keys(config: Config, parts: Parts, tasks: Tasks, step: int) -> Array:
+    """Returns the keys `[S, K]` of the critics."""
+    keys = trial_keys(config, CRITIC, step)
+    return key_per(robots.places(parts.robot, tasks), keys)

@@ -200,9 +200,7 @@ def _here(
             return error.exit_code
         finally:
             devices.put(device)
-        how = "complete" if code == 0 else f"exit code {code}, see {log}"
-        print(f"{job.name}: {how}  {time.monotonic() - begin:.0f} s", flush=True)
-        return code
+        return _told(job, code, log, f"  {time.monotonic() - begin:.0f} s")
 
     def started(job: Job, log: Path, device: str | None) -> int:
         with disk.opened(log, os.O_WRONLY | os.O_APPEND) as file:
@@ -280,8 +278,13 @@ def _ended(job: Job, task: Any) -> int:
     except Exception as error:  # submitit's are of many kinds
         print(f"{job.name}: {str(error).splitlines()[0]}", flush=True)
         return 1
-    how = "complete" if code == 0 else f"exit code {code}, see {task.paths.stderr}"
-    print(f"{job.name}: {how}", flush=True)
+    return _told(job, code, task.paths.stderr)
+
+
+def _told(job: Job, code: int, log: Path, after: str = "") -> int:
+    """Says how a run has ended; returns its exit code."""
+    how = "complete" if code == 0 else f"exit code {code}, see {log}"
+    print(f"{job.name}: {how}{after}", flush=True)
     return code
 
 

@@ -24,6 +24,7 @@ LAYERS = {
     "_src.tensor_file": 0,
     "_src.moments": 1,
     "_src.elites": 1,
+    "_src.guards": 0,
     "_src.returns": 1,
     "_src.batches": 1,
     "_src.chunks": 1,

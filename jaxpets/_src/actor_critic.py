@@ -28,7 +28,8 @@ from jaxpets._src.checks import (
     check_record,
 )
 from jaxpets._src.fitter import Optimizer, check_optimizer
-from jaxpets._src.imagined_trials import imagine, single_reward
+from jaxpets._src.imagined_trials import imagine
+from jaxpets._src.returns import single_reward
 from jaxpets._src.types import (
     Dataset,
     DynamicsFn,

@@ -1,6 +1,5 @@
 """One gradient step of an actor and two critics on imagined trials."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -16,6 +15,7 @@ from jaxpets._src.actor_critic_records import (
     ActorCriticState,
 )
 from jaxpets._src.fitter import Optimizer
+from jaxpets._src.guards import choose, is_finite
 from jaxpets._src.imagined_trials import Imagined
 
 # Keeps the actor's outputs where its tanh has a slope.
@@ -84,10 +84,9 @@ def build_update(
                 grads, state.opt_state, cast(Any, old)
             )
         new = jax.tree.map(jnp.add, old, updates)
-        finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(new)]
-        good = jnp.all(jnp.stack(finite))
-        (actor, critics), opt_state = jax.tree.map(
-            functools.partial(jnp.where, good), (new, opt_state), (old, state.opt_state)
+        good = is_finite(new)
+        (actor, critics), opt_state = choose(
+            good, (new, opt_state), (old, state.opt_state)
         )
 
         def follow(slow: Array, fast: Array) -> Array:

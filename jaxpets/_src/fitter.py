@@ -21,6 +21,7 @@ from jaxpets._src.checks import (
 )
 from jaxpets._src.ensemble import Ensemble, params_check
 from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.guards import choose, is_finite
 from jaxpets._src.types import Dataset
 
 # Updates between two looks at how many there are: a GPU's host waits for each.
@@ -169,7 +170,7 @@ def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitte
         has_rows = batch.num_rows > 0.0
         finite = _all_finite(ensemble.sentinels(grads), nll)
         good = has_rows & finite
-        network, opt_state = _where(
+        network, opt_state = choose(
             good, (new_network, new_opt_state), (network, opt_state)
         )
         mean = _Totals(nll, mse, jnp.ones_like(nll))
@@ -258,11 +259,9 @@ def _kept(before: _Progress, after: _Progress, num_batches: Array) -> _Progress:
 
     To look at all weights after every update would cost a fifth of a step on a GPU.
     """
-    leaves = jax.tree.leaves((after.network, after.opt_state))
-    floats = [x for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
-    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats])
     refused = before._replace(num_skipped=before.num_skipped + num_batches)
-    return _where(jnp.all(finite), after, refused)
+    finite = is_finite((after.network, after.opt_state))
+    return choose(finite, after, refused)
 
 
 def _zeros() -> _Totals:
@@ -272,7 +271,3 @@ def _zeros() -> _Totals:
 def _all_finite(*trees: Any) -> Array:
     leaves = jax.tree.leaves(trees)
     return jnp.all(jnp.isfinite(jnp.concatenate([x.ravel() for x in leaves])))
-
-
-def _where(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(functools.partial(jnp.where, condition), new, old)

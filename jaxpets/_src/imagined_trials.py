@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array
-from jaxpets._src.returns import checked_reward
+from jaxpets._src.returns import single_reward
 from jaxpets._src.types import DynamicsFn, RewardFn
 
 # `(its params, key, rewards [E, B, ...], obs [E, B, D]) -> action [E, B, A]`.
@@ -33,16 +33,6 @@ class Imagined(NamedTuple):
     next_obs: Array
     goes_on: Array
     counts: Array
-
-
-def single_reward(reward_fn: RewardFn) -> Callable[[Any, Array, Array, Array], Array]:
-    """Returns reward_fn of one state: `(data, obs [D], action [A], next_obs [D])`."""
-    reward = checked_reward(reward_fn)
-
-    def of_state(data: Any, obs: Array, action: Array, next_obs: Array) -> Array:
-        return jnp.mean(reward(data, obs[None, None], action, next_obs[None, None]))
-
-    return of_state
 
 
 def imagine(

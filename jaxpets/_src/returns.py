@@ -36,6 +36,16 @@ def checked_reward(reward_fn: RewardFn) -> RewardFn:
     return reward
 
 
+def single_reward(reward_fn: RewardFn) -> Callable[[Any, Array, Array, Array], Array]:
+    """Returns reward_fn of one state: `(data, obs [D], action [A], next_obs [D])`."""
+    reward = checked_reward(reward_fn)
+
+    def of_state(data: Any, obs: Array, action: Array, next_obs: Array) -> Array:
+        return jnp.mean(reward(data, obs[None, None], action, next_obs[None, None]))
+
+    return of_state
+
+
 def candidate_returns(
     reward_fn: RewardFn,
     terminal_fn: Callable[[Any, Array], Array] | None,
@@ -53,9 +63,11 @@ def candidate_returns(
     undiscounted = not isinstance(discount, Array) and discount == 1
     if terminal_fn is None and risk_fn is None and value_fn is None and undiscounted:
         return _mean_returns(reward)
+    ends = value = None
     if terminal_fn is not None:
-        check_callable("terminal_fn", terminal_fn)
-    value = None if value_fn is None else _checked_value(value_fn)
+        ends = _of_particles("terminal_fn", terminal_fn, jnp.bool_)
+    if value_fn is not None:
+        value = _of_particles("value_fn", value_fn, jnp.float32)
     risk = jnp.mean if risk_fn is None else _checked_risk(risk_fn)
 
     def every(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
@@ -68,8 +80,8 @@ def candidate_returns(
         if value is not None:
             last = jax.vmap(value, (None, 1))(params, path[-1])
             rewards = jnp.concatenate([rewards, last[None]])
-        if terminal_fn is not None:
-            alive = _alive(terminal_fn, params, path[1:])
+        if ends is not None:
+            alive = _alive(ends, params, path[1:])
             rewards = jnp.where(alive[: rewards.shape[0]], rewards, 0.0)
         steps = jnp.arange(rewards.shape[0], dtype=jnp.float32)
         weights = jnp.asarray(discount, jnp.float32) ** steps
@@ -96,46 +108,37 @@ def _mean_returns(reward_fn: RewardFn) -> ReturnsFn:
     return returns
 
 
-def _alive(
-    terminal_fn: Callable[[Any, Array], Array], params: Any, next_obs: Array
-) -> Array:
+def _alive(ends: Callable[[Any, Array], Array], params: Any, next_obs: Array) -> Array:
     """Tells `[H+1, N, E, P]` which steps earn: those before which nothing has ended.
 
     The last is what comes after the horizon.
     """
-
-    def ended(params: Any, obs: Array) -> Array:
-        particles = obs.shape[:-1]
-        result = jnp.asarray(terminal_fn(params, obs))
-        if result.dtype != jnp.bool_ or result.shape not in ((), particles):
-            raise ValueError(
-                f"terminal_fn must return bool of shape () or {particles}, got "
-                f"{result.dtype}{list(result.shape)}."
-            )
-        return jnp.broadcast_to(result, particles)
-
-    ends = jax.vmap(jax.vmap(ended, (None, 1)), (None, 0))(params, next_obs)
-    ends = jax.lax.cummax(ends.astype(jnp.int32)) > 0
-    start = jnp.zeros((1, *ends.shape[1:]), bool)
-    return ~jnp.concatenate([start, ends])
+    ended = jax.vmap(jax.vmap(ends, (None, 1)), (None, 0))(params, next_obs)
+    ended = jax.lax.cummax(ended.astype(jnp.int32)) > 0
+    start = jnp.zeros((1, *ended.shape[1:]), bool)
+    return ~jnp.concatenate([start, ended])
 
 
-def _checked_value(
-    value_fn: Callable[[Any, Array], Array],
+def _of_particles(
+    name: str, function: Callable[[Any, Array], Array], dtype: Any
 ) -> Callable[[Any, Array], Array]:
-    check_callable("value_fn", value_fn)
+    """Returns a function with a check, when traced, of what it says of each particle.
 
-    def value(params: Any, obs: Array) -> Array:
+    What it says of all of them at once is said of each.
+    """
+    check_callable(name, function)
+
+    def of_each(params: Any, obs: Array) -> Array:
         particles = obs.shape[:-1]
-        result = jnp.asarray(value_fn(params, obs))
-        if result.dtype != jnp.float32 or result.shape not in ((), particles):
+        result = jnp.asarray(function(params, obs))
+        if result.dtype != dtype or result.shape not in ((), particles):
             raise ValueError(
-                f"value_fn must return float32 of shape () or {particles}, got "
-                f"{result.dtype}{list(result.shape)}."
+                f"{name} must return {jnp.dtype(dtype)} of shape () or {particles}, "
+                f"got {result.dtype}{list(result.shape)}."
             )
         return jnp.broadcast_to(result, particles)
 
-    return value
+    return of_each
 
 
 def _checked_risk(risk_fn: Callable[[Array], Array]) -> Callable[[Array], Array]:

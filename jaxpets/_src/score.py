@@ -3,11 +3,10 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_record
-from jaxpets._src.returns import checked_reward
+from jaxpets._src.returns import single_reward
 from jaxpets._src.types import RewardFn, Transition
 
 
@@ -36,13 +35,9 @@ def score(reward_fn: RewardFn, params: Any, transitions: Transition) -> Array:
     >>> score(speed, 0.5, Transition(obs[:-1], jnp.zeros((3, 1)), obs[1:])).tolist()
     [2.0, 6.0, 10.0]
     """
-    reward = checked_reward(reward_fn)
+    reward = single_reward(reward_fn)
     check_record("transitions", transitions, Transition)
     check_array("transitions.obs", transitions.obs, ["T", "D"])
     check_array("transitions.action", transitions.action, [len(transitions.obs), "A"])
     check_array("transitions.next_obs", transitions.next_obs, transitions.obs.shape)
-
-    def one(obs: Array, action: Array, next_obs: Array) -> Array:
-        return jnp.mean(reward(params, obs[None, None], action, next_obs[None, None]))
-
-    return jax.vmap(one)(*transitions)
+    return jax.vmap(reward, (None, 0, 0, 0))(params, *transitions)

@@ -111,13 +111,18 @@ def test_a_run_goes_on_in_tensorboard(opened, tmp_path, mp4, capsys):
     assert "tracked: tensorboard --logdir " in capsys.readouterr().err
 
 
-def test_a_run_goes_on_in_wandb(opened, tmp_path, mp4, capsys):
-    pytest.importorskip("wandb")
+def twice(opened, kind, mp4):
+    """Shows two trials of a run, opened for each, and a video; returns its name."""
     for trial in (1, 2):
-        with opened("wandb") as run:
+        with opened(kind) as run:
             record(run, trial)
             run.track_video(trial, "forward", mp4)
-    known = rundir.read_json(tmp_path / "run" / rundir.IDENTITY)["id"]
+    return rundir.read_json(run.path / rundir.IDENTITY)["id"]
+
+
+def test_a_run_goes_on_in_wandb(opened, tmp_path, mp4, capsys):
+    pytest.importorskip("wandb")
+    known = twice(opened, "wandb", mp4)
     logs = sorted((tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb"))
     assert [log.name for log in logs] == [f"run-{known}.wandb"] * 2
     for log in logs:
@@ -128,11 +133,7 @@ def test_a_run_goes_on_in_wandb(opened, tmp_path, mp4, capsys):
 
 def test_a_run_goes_on_in_trackio(opened, tmp_path, mp4):
     pytest.importorskip("trackio")
-    for trial in (1, 2):
-        with opened("trackio") as run:
-            record(run, trial)
-            run.track_video(trial, "forward", mp4)
-    known = rundir.read_json(tmp_path / "run" / rundir.IDENTITY)["id"]
+    known = twice(opened, "trackio", mp4)
     with sqlite3.connect(tmp_path / "trackio_dir" / "jaxpets.db") as base:
         rows = base.execute("select run_name, step, metrics from metrics").fetchall()
         configs = base.execute("select config from configs").fetchall()
