@@ -15,6 +15,7 @@ import jaxpets
 from jaxpets import rewards
 from jaxpets.envs import Robot
 
+from ..acting import at_start
 from .command import Command, RewardChoice, bound, earned_of, reward_of
 from .geometry import pushes
 from .session import Frame
@@ -133,10 +134,7 @@ def _start(robot: Robot, planner: jaxpets.Planner) -> Callable[..., World]:
     track = _track(robot)
 
     def start(choice: RewardChoice, key: Array) -> World:
-        if robot.task_reset is not None:
-            state = robot.task_reset(choice.task, key)
-        else:
-            state = robot.env.reset(key)
+        state = at_start(robot, choice.task).reset(key)
         qpos = _drawn(state, track(state.obs[None])[0])
         return World(state, planner.init(), jnp.int32(0), qpos)
 

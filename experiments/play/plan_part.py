@@ -60,9 +60,13 @@ class PlanPart:
         if session.back > 0:
             return
         step_time = session.stepper.step_time
-        found = readout.curves(session.history.recent(MEMORY), self._horizon, step_time)
+        # A promise is as old as the horizon; no more frames than are drawn are summed.
+        seconds = _CURVE_SECONDS + self._horizon * step_time
+        frames = session.history.recent(seconds)
+        found = readout.curves(frames, self._horizon, step_time)
         write(self._returns, readout.returns(found))
-        most = max(np.nanmax(found.disagreement, initial=0.0), 1e-9)
+        minute = [frame.disagreement for frame in session.history.recent(MEMORY)]
+        most = max(np.nanmax(minute, initial=0.0), 1e-9)
         share = np.nan_to_num(frame.disagreement) / most
         self._bar.value = float(np.clip(100 * share, 0, 100))
         shown = slice(-round(_CURVE_SECONDS / step_time), None)

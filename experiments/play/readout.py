@@ -22,13 +22,11 @@ class Curves(NamedTuple):
       promised: the return per step that was foreseen H steps before.
       earned: the return per step since then; NaN where nothing says it, or where
         something else was asked for on the way.
-      disagreement: about what was foreseen.
     """
 
     seconds: np.ndarray
     promised: np.ndarray
     earned: np.ndarray
-    disagreement: np.ndarray
 
 
 def curves(frames: Sequence[Frame], horizon: int, step_time: float) -> Curves:
@@ -36,7 +34,6 @@ def curves(frames: Sequence[Frame], horizon: int, step_time: float) -> Curves:
     seconds = step_time * np.arange(1 - len(frames), 1)
     foreseen = np.array([frame.promised for frame in frames], float)
     rewards = np.array([frame.earned for frame in frames], float)
-    disagreement = np.array([frame.disagreement for frame in frames], float)
     promised, earned = np.full((2, len(frames)), np.nan)
     ends = [i for i in range(1, len(frames)) if not _follows(frames[i - 1], frames[i])]
     begins = np.zeros(len(frames), int)  # of the stretch without a change
@@ -46,7 +43,7 @@ def curves(frames: Sequence[Frame], horizon: int, step_time: float) -> Curves:
         if begins[i] <= i - horizon:
             promised[i] = foreseen[i - horizon + 1]
             earned[i] = rewards[i - horizon + 1 : i + 1].mean()
-    return Curves(seconds, promised, earned, disagreement)
+    return Curves(seconds, promised, earned)
 
 
 def _follows(before: Frame, after: Frame) -> bool:
