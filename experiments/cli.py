@@ -103,7 +103,7 @@ def results_folder(config: Config) -> Path:
 def variant(config: Config, step: int) -> str:
     """Returns the name of the folder of a later phase: zero-shot-060-TASKS-TASK-TAG."""
     tasks = [rundir.label(config.tasks)] if config.tasks else []
-    task = [config.task] if config.task != "all" else []
+    task = [rundir.label(config.task)] if config.task != "all" else []
     tag = [config.tag] if config.tag else []
     return "-".join([config.phase, f"{step:03d}", *tasks, *task, *tag])
 

@@ -253,7 +253,7 @@ class Variant:
     """Which tasks phase 2 is about, and which variant of it this is."""
 
     task: str = "all"
-    """The task to perform; by default all of the robot."""
+    """The tasks to perform, as walk,run; by default all of the robot."""
     tasks: str | None = None
     """FILE.py of your own: `def tasks()` gives rewards, in place of the robot's."""
     tag: str | None = None

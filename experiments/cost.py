@@ -108,9 +108,9 @@ def _critic_steps(config: Config) -> int:
 
 def _num_tasks(config: Config) -> int:
     """Returns how many tasks are planned for at once; exploration is one."""
-    if config.phase == "explore" or config.task != "all":
+    if config.phase == "explore":
         return 1
-    return len(robots.of(config).tasks.names)
+    return len(robots.names(config, robots.of(config)))
 
 
 def _planned_steps(config: Config) -> int:

@@ -67,7 +67,7 @@ def jobs(sweep: Sweep) -> Iterator[Job]:
         place = dict(zip(sweep.grid, values, strict=True))
         flags = _flat(sweep.flags)
         for where in sweep.where:
-            if all(place.get(name) in among for name, among in where.grid.items()):
+            if _is_at(place, where.grid):
                 flags |= _flat(where.flags)
         flags |= {name: _checked(name, value) for name, value in place.items()}
         name = "-".join(rundir.label(_words(value)) for value in values)
@@ -77,9 +77,25 @@ def jobs(sweep: Sweep) -> Iterator[Job]:
         # A user's file has to be named again, since no run's config may name one.
         own += _line({x: flags[x] for x in ("env", "arm") if x in flags})
         for later in sweep.then:
-            phase, *rest = _phase(later)
-            commands.append([phase, *own, *rest])
+            grid, rest = _split(later)
+            if _is_at(place, grid):
+                phase, *rest = _phase(rest)
+                commands.append([phase, *own, *rest])
         yield Job(name, commands)
+
+
+def _is_at(place: Mapping[str, Any], grid: Grid) -> bool:
+    """Returns whether a run's place in the grid is among these."""
+    return all(place.get(name) in among for name, among in grid.items())
+
+
+def _split(later: Flags) -> tuple[Grid, Flags]:
+    """Returns for which runs a later phase is, and its flags."""
+    flags = dict(later)
+    try:
+        return msgspec.convert(flags.pop("grid", {}), Grid), flags
+    except msgspec.ValidationError as error:
+        raise UsageError(f"then.grid is not valid: {error}") from error
 
 
 def _phase(later: Flags) -> list[str]:

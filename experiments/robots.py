@@ -100,10 +100,14 @@ def sizes(robot: "Robot") -> tuple[int, int]:
 
 def chosen(config: Config, robot: "Robot") -> "Tasks":
     """Returns the tasks that phase 2 is about, K of the robot's."""
-    every = robot.tasks
-    tasks = every if config.task == "all" else every._replace(names=(config.task,))
+    tasks = robot.tasks._replace(names=names(config, robot))
     ids = jnp.asarray(places(robot, tasks))
-    return tasks._replace(params=jax.tree.map(lambda x: x[ids], every.params))
+    return tasks._replace(params=jax.tree.map(lambda x: x[ids], tasks.params))
+
+
+def names(config: Config, robot: "Robot") -> tuple[str, ...]:
+    """Returns the tasks that a config names; `all` are those of the robot."""
+    return robot.tasks.names if config.task == "all" else tuple(config.task.split(","))
 
 
 def places(robot: "Robot", tasks: "Tasks") -> list[int]:
@@ -117,11 +121,11 @@ def check_tasks(config: Config, robot: "Robot") -> None:
     Raises:
       UsageError: naming the flag.
     """
-    names = ("all", *robot.tasks.names)
-    if config.task not in names:
-        valid = f"it must be {', '.join(names)}"
+    own, wanted = robot.tasks.names, names(config, robot)
+    if not set(wanted) <= set(own) or len(set(wanted)) < len(wanted):
+        valid = f"it must be all, or of {', '.join(own)} each at most once"
         raise UsageError(f"--task {config.task} is not valid; {valid}.")
-    if config.tag in names:
+    if config.tag in ("all", *own):
         valid = "it must be something else; it is a task"
         raise UsageError(f"--tag {config.tag} is not valid; {valid}.")
 

@@ -113,8 +113,8 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
 
     plain = to_json(config)
     branches = len(config.seeds)
-    if (config.phase, config.task) == ("finetune", "all"):
-        branches *= len(robots.of(config).tasks.names)
+    if config.phase == "finetune":
+        branches *= len(robots.names(config, robots.of(config)))
     size = _NEEDED_BYTES * branches
     with (
         signals.stoppable() as late,

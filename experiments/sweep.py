@@ -50,8 +50,9 @@ A sweep is a file like this:
   phase = "zero-shot"
 
   [[then]]
+  grid.env = ["dmc/walker"]   # for these alone
   phase = "zero-shot"
-  tag = "longer"
+  task = "stand,walk"
   task-planner.horizon = 30
 
   [slurm]                     # of submitit, with --slurm

@@ -1,5 +1,6 @@
 from typing import get_args
 
+import chex
 import jax
 import jax.numpy as jnp
 import pytest
@@ -7,7 +8,7 @@ import pytest
 import jaxpets
 from experiments import cli, robots
 from experiments.build import build
-from experiments.config import ArmName
+from experiments.config import ArmName, Config
 from jaxpets import envs
 from jaxpets.envs import half_cheetah
 
@@ -152,3 +153,12 @@ def test_on_a_cpu_a_plan_is_that_of_the_scan():
     flags = ["--task-planner.precision", "f32"]
     got, want = value(*flags), value(*flags, "--task-planner.no-fused")
     assert float(got) == pytest.approx(float(want), rel=1e-4)
+
+
+def test_some_of_a_robots_tasks():
+    robot = robots.of(Config())
+    tasks = robots.chosen(Config(task="back-flip,backward"), robot)
+    assert tasks.names == ("back-flip", "backward")
+    for i, name in enumerate(tasks.names):
+        found = jax.tree.map(lambda x, i=i: x[i], tasks.params)
+        chex.assert_trees_all_equal(found, half_cheetah.task(name))

@@ -211,7 +211,11 @@ def test_a_run_keeps_its_labels(fail, out):
         (("--num-bits", "16"), "--num-bits 16 is not valid; it must be 32"),
         (("--num-trials", "4"), "--num-trials 4 is not valid; it must be 3"),
         (("--model.hidden-size", "8"), "--model.hidden-size 8 is not valid"),
-        (("--task", "swim"), "--task swim is not valid; it must be all, forward, back"),
+        (
+            ("--task", "swim"),
+            "--task swim is not valid; it must be all, or of forward,",
+        ),
+        (("--task", "forward,forward"), "each at most once"),
         (
             ("--tasks", "x"),
             "--tasks x is not valid; it must be FILE.py or FILE.py:NAME",

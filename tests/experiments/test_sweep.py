@@ -35,6 +35,11 @@ flags.planner.no-fused = true
 phase = "zero-shot"
 task = "forward"
 """
+THEN_FINETUNE = """
+[[then]]
+grid.arm = ["pink-noise"]
+phase = "finetune"
+"""
 
 
 @pytest.fixture
@@ -50,8 +55,9 @@ def file(tmp_path):
 
 
 def test_every_combination_is_a_run_with_its_flags(file, tmp_path):
-    random, pink = grid.jobs(grid.read(file(FILE + THEN)))
+    random, pink = grid.jobs(grid.read(file(FILE + THEN + THEN_FINETUNE)))
     explore, perform = random.commands
+    assert [command[0] for command in pink.commands[1:]] == ["zero-shot", "finetune"]
     own = ["--out", str(tmp_path / "runs"), "--name", "random"]
     assert random.name == "random" and explore[:5] == ["explore", *own]
     said = " ".join(explore)
@@ -87,6 +93,7 @@ def test_lists_are_words_and_the_last_entry_is_the_fastest(file):
         (FILE.replace('["random', '["../x/.py'), "--arm"),
         (FILE + '[[then]]\nphase = "explore"', "then.phase 'explore'"),
         (FILE + '[[then]]\nphase = "zero-shot"\neval-trials = 0', "--eval-trials 0"),
+        (FILE + '[[then]]\nphase = "zero-shot"\ngrid.arm = 3', "then.grid"),
     ],
 )
 def test_what_is_not_valid_is_refused_before_anything_runs(
