@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -16,13 +16,16 @@ Points = dict[int, dict[int, float]]  # trial -> seed -> number
 Scores = dict[str, dict[str, dict[int, float]]]  # arm -> task -> seed -> score
 
 
+_Tasks = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._,-]{0,999}\Z")]
+
+
 class _Labels(msgspec.Struct):
     """What the report reads of a config; some of it gets into names of files."""
 
     preset: Name
     env: str = rundir.HALF_CHEETAH
     arm: str = "epistemic"
-    task: Name = "all"
+    task: _Tasks = "all"
     tag: Name | None = None
     num_bits: int = 0
 
@@ -65,12 +68,13 @@ def files(out: Path, name: str) -> list[Path]:
 
 
 def _is_part(log: Path) -> bool:
-    """Tells if the folder beside this one has done all tasks, this one among them."""
+    """Tells if the folder beside this one has done all tasks, these among them."""
     folder = log.parent
     task = config(folder).get("task", "all")
     if task == "all":
         return False
-    whole = folder.with_name(folder.name.replace(f"-{task}", "", 1)) / log.name
+    part = f"-{rundir.label(task)}"
+    whole = folder.with_name(folder.name.replace(part, "", 1)) / log.name
     return whole != log and whole.exists() and whole.stat().st_size > 0
 
 

@@ -179,13 +179,14 @@ def test_differences_of_means_are_of_our_arms_and_of_variants(plain):
     assert "| count-16 | epistemic |" not in text
 
 
-def test_a_task_alone_does_not_count_beside_all(out):
+@pytest.mark.parametrize("tasks", ["forward", "forward,backward"])
+def test_some_tasks_alone_do_not_count_beside_all(out, tasks):
     run = out / "laptop-epistemic"
-    rows = [
-        row for row in zero_shot_rows("epistemic", [1.0]) if row["task"] == "forward"
-    ]
+    found = zero_shot_rows("epistemic", [1.0])
+    rows = [row for row in found if row["task"] in tasks.split(",")]
     config = {"phase": "zero-shot", "arm": "epistemic"}
-    write_run(run / "zero-shot-003-forward", rows, task="forward", **config)
+    name = f"zero-shot-003-{tasks.replace(',', '-')}"
+    write_run(run / name, rows, task=tasks, **config)
     _, table = report_of(out)
     assert table["epistemic"]["forward"]["seeds"] == [400.0, 500.0, 900.0]
     (run / "zero-shot-003" / "metrics.jsonl").unlink()

@@ -1,0 +1,196 @@
+"""`python -m experiments.tools.suite RUNS`: the suite's twenty tasks, beside others'.
+
+Reads the zero-shot logs of `dmc/...` robots, and prints a table in Markdown: means over
+seeds and their 95 % intervals, the mean of the tasks, and what others have published.
+"""
+
+import argparse
+import statistics
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from .. import calling, robots, signals
+from ..config import Config
+from ..errors import RunError, UsageError, last_line, storage_errors
+from ..report import logs, stats, tables
+from ..storage import rundir
+
+# Of Plan2Explore's ten domains. A finger that spins has another damping: two robots.
+TASKS = {
+    "acrobot": ("swingup",),
+    "ball_in_cup": ("catch",),
+    "cartpole": ("balance", "balance-sparse", "swingup", "swingup-sparse"),
+    "cheetah": ("run",),
+    "finger": ("turn-easy", "turn-hard"),
+    "finger-spin": ("spin",),
+    "hopper": ("stand", "hop"),
+    "pendulum": ("swingup",),
+    "quadruped": ("walk", "run"),
+    "reacher": ("easy", "hard"),
+    "walker": ("stand", "walk", "run"),
+}
+NAMES = tuple(
+    f"{domain.partition('-')[0]}/{task}"
+    for domain, tasks in TASKS.items()
+    for task in tasks
+)
+PEERS = Path("results/dmc20-peers.json")
+Results = dict[str, dict[str, dict[str, Any]]]  # arm -> domain/task -> numbers
+
+
+class System(msgspec.Struct, frozen=True):
+    """Somebody else's numbers: after so many steps, with the reward or without."""
+
+    name: str
+    reward: bool
+    steps: list[int]
+    source: str
+    about: str
+
+
+class Peers(msgspec.Struct, frozen=True):
+    """Returns by system and task, one for each of the system's steps."""
+
+    systems: list[System]
+    returns: dict[str, dict[str, list[float]]]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Writes the results, and prints the table; returns an exit code."""
+    parser = argparse.ArgumentParser(
+        prog=calling.usage("tools.suite"), description=__doc__
+    )
+    parser.add_argument("runs", type=Path, help="a folder with runs below it")
+    parser.add_argument("--explored", type=int, default=100, help="exploration trials")
+    parser.add_argument("--tag", default="", help="the variant of phase 2")
+    parser.add_argument("--peers", type=Path, default=PEERS, help="others' numbers")
+    parser.add_argument("--json", type=Path, help="file for the results")
+    args = parser.parse_args(argv)
+    try:
+        found = results(args.runs, args.explored, args.tag)
+        peers = read_peers(args.peers)
+        if args.json is not None:
+            with storage_errors(f"write {args.json}"):
+                rundir.write_json(args.json, found)
+    except RunError as error:
+        signals.say(last_line(error))
+        return error.exit_code
+    print("\n".join(table(found, peers)))
+    return 0
+
+
+def results(runs: Path, explored: int, tag: str) -> Results:
+    """Returns the mean, the interval and each seed's mean, by arm and task.
+
+    Args:
+      runs: a folder with runs below it.
+      explored: for models that explored so many trials.
+      tag: of the variant of phase 2; empty for the one without.
+
+    Raises:
+      RunError: if a log cannot be read, or there is none.
+    """
+    rows = [row for row in logs.load(runs) if row.tag == tag]
+    found: Results = {}
+    for domain, tasks in TASKS.items():
+        own = [row for row in rows if _robot(row) == f"dmc/{domain}"]
+        for arm, scores in logs.scores(own, explored).items():
+            steps = explored * _trial_steps(own)
+            for task in tasks:
+                if task in scores:
+                    name = f"{domain.partition('-')[0]}/{task}"
+                    found.setdefault(arm, {})[name] = _numbers(scores[task], steps)
+    return found
+
+
+def table(found: Results, peers: Peers) -> list[str]:
+    """Returns the tasks as rows: our arms, then others after fewest and most steps."""
+    arms = tables.in_order(found)
+    columns = [(x, i) for x in peers.systems for i in (0, -1)]
+    lines = [
+        [name, *(_cell(found[arm].get(name)) for arm in arms)]
+        + [f"{peers.returns[x.name][name][i]:.0f}" for x, i in columns]
+        for name in NAMES
+    ]
+    theirs = [
+        f"{statistics.mean(peers.returns[x.name][name][i] for name in NAMES):.0f}"
+        for x, i in columns
+    ]
+    lines.append(["**mean**", *(_mean(found[arm]) for arm in arms), *theirs])
+    said = [f"{x.name}, {x.steps[i] / 1e6:g}M" for x, i in columns]
+    about = [
+        f"- {x.name} ({'with' if x.reward else 'without'} the reward): {x.source}. "
+        f"{x.about}"
+        for x in peers.systems
+    ]
+    return [*tables.table(["task", *(f"`{x}`" for x in arms), *said], lines), *about]
+
+
+def read_peers(path: Path) -> Peers:
+    """Reads a file of others' numbers.
+
+    Raises:
+      RunError: if it is not there, or is not one.
+    """
+    try:
+        return msgspec.convert(rundir.read_json(path), Peers)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{path} has no numbers of others: {error}") from error
+
+
+def _robot(row: logs.Row) -> str:
+    return str(logs.config(row.run).get("env"))
+
+
+def _trial_steps(rows: Sequence[logs.Row]) -> int:
+    """Returns the suite's control steps in a trial of exploration."""
+    config = logs.config(rows[0].run)
+    repeat = robots.of(Config(env=config["env"])).action_repeat
+    return int(config["trial_length"]) * repeat
+
+
+def _numbers(scores: Mapping[int, float], steps: int) -> dict[str, Any]:
+    summary = stats.summarize(np.array(list(scores.values()), float))
+    interval = summary.ci95 if summary else None
+    return {
+        "mean": round(summary.mean, 1) if summary else None,
+        "interval": [round(x, 1) for x in interval] if interval else None,
+        "seeds": {str(seed): round(score, 1) for seed, score in scores.items()},
+        "steps": steps,
+    }
+
+
+def _cell(numbers: Mapping[str, Any] | None) -> str:
+    if numbers is None:
+        return "-"
+    if numbers["mean"] is None:
+        return "not finite"
+    text = f"{numbers['mean']:.0f}"
+    if numbers["interval"]:
+        text += " [{:.0f}, {:.0f}]".format(*numbers["interval"])
+    return text
+
+
+def _mean(numbers: Mapping[str, Mapping[str, Any]]) -> str:
+    """Returns the mean of tasks, and of how many if some are missing.
+
+    With an interval over seeds if all tasks have the same: a seed's mean is one number.
+    """
+    seeds = {frozenset(x["seeds"]) for x in numbers.values()}
+    of_seeds = [
+        statistics.mean(x["seeds"][seed] for x in numbers.values())
+        for seed in sorted(seeds.pop() if len(seeds) == 1 else ())
+    ]
+    mean = statistics.mean(x["mean"] for x in numbers.values())
+    interval = stats.t_interval(np.array(of_seeds))
+    text = _cell({"mean": mean, "interval": interval})
+    return text if len(numbers) == len(NAMES) else f"{text} (of {len(numbers)})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""Twenty tasks of the suite beside others' numbers."""
+
+import json
+from pathlib import Path
+
+import pytest
+from small_logs import write_run
+
+from experiments.tools import suite
+
+PEERS = {
+    "systems": [
+        {"name": "Rival", "reward": True, "steps": [100_000, 500_000, 1_000_000],
+         "source": "their page", "about": "It counts otherwise."}
+    ],
+    "returns": {"Rival": {name: [10, 20, 31] for name in suite.NAMES}},
+}  # fmt: skip
+
+
+def performed(folder, env, returns, tag=None, explored=4):
+    """A run whose seeds 0, 1, ... returned these, by task, in two trials each."""
+    rows = [
+        {"phase": "zero-shot", "arm": "best", "explored_trials": explored,
+         "seed": seed, "task": task, "trial": trial, "return": value + trial}
+        for task, values in returns.items()
+        for seed, value in enumerate(values)
+        for trial in (-1, 1)
+    ]  # fmt: skip
+    name = f"zero-shot-004{f'-{tag}' if tag else ''}"
+    config = {"phase": "zero-shot", "arm": "best", "env": env, "trial_length": 250}
+    write_run(folder / name, rows, tag=tag, **config)
+
+
+@pytest.fixture
+def runs(tmp_path):
+    folder = tmp_path / "runs"
+    performed(folder / "cheetah", "dmc/cheetah", {"run": [500, 700], "jump": [1, 1]})
+    performed(folder / "spin", "dmc/finger-spin", {"spin": [100, 300]})
+    performed(folder / "spin", "dmc/finger-spin", {"spin": [0, 0]}, tag="actor")
+    performed(folder / "other", "gym/Hopper-v5", {"run": [9, 9]})
+    return folder
+
+
+@pytest.fixture
+def peers(tmp_path):
+    path = tmp_path / "peers.json"
+    path.write_text(json.dumps(PEERS))
+    return str(path)
+
+
+def test_results_are_of_the_tasks_that_others_have(runs, tmp_path, peers, capsys):
+    path = tmp_path / "suite.json"
+    flags = ["--explored", "4", "--peers", peers, "--json", str(path)]
+    assert suite.main([str(runs), *flags]) == 0
+    found = json.loads(path.read_text())["best"]
+    assert set(found) == {"cheetah/run", "finger/spin"}
+    run = found["cheetah/run"]
+    assert run["seeds"] == {"0": 500, "1": 700} and run["mean"] == 600
+    # 4 trials of 250 steps, of which each holds its action for four of the suite's.
+    assert run["steps"] == 4000
+    assert run["interval"] == pytest.approx([600 - 1270.6, 600 + 1270.6], abs=0.1)
+    text = capsys.readouterr().out
+    assert "| task | `best` | Rival, 0.1M | Rival, 1M |" in text
+    assert "| cheetah/run | 600 [-671, 1871] | 10 | 31 |" in text
+    assert "| walker/run | - | 10 | 31 |" in text
+    # Of a seed's mean, 300 and 500: the interval is over seeds, not over tasks.
+    assert "| **mean** | 400 [-871, 1671] (of 2) | 10 | 31 |" in text
+    assert "- Rival (with the reward): their page. It counts otherwise." in text
+
+
+def test_a_variant_is_asked_for(runs, tmp_path, peers, capsys):
+    flags = ["--explored", "4", "--peers", peers, "--tag", "actor"]
+    assert suite.main([str(runs), *flags]) == 0
+    assert "| finger/spin | 0 [0, 0] | 10 | 31 |" in capsys.readouterr().out
+
+
+def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
+    assert suite.main([str(tmp_path / "none"), "--peers", peers]) == 2
+    assert "there is no metrics.jsonl" in capsys.readouterr().err
+    path = tmp_path / "peers.json"
+    path.write_text("{}")
+    assert suite.main([str(runs), "--explored", "4", "--peers", peers]) == 2
+    assert f"{path} has no numbers of others" in capsys.readouterr().err
+
+
+def test_the_committed_numbers_of_others_are_of_every_task():
+    peers = suite.read_peers(Path(__file__).parents[2] / suite.PEERS)
+    assert {x.name for x in peers.systems} == set(peers.returns)
+    for system in peers.systems:
+        returns = peers.returns[system.name]
+        assert set(returns) == set(suite.NAMES)
+        assert all(len(x) == len(system.steps) for x in returns.values())
