@@ -62,8 +62,8 @@ def _check_members(config: Config) -> None:
 def _check_critic(config: Config) -> None:
     updates = config.critic.num_updates
     if not updates:
-        alone = "left out without --critic.num-updates"
-        require(not config.critic.acts, "--critic.acts", "", alone)
+        alone = "False without --critic.num-updates"
+        require(not config.critic.acts, "--critic.acts", True, alone)
     if config.phase == "finetune":
         require(not updates, "--critic.num-updates", updates, "0 in finetune")
     if updates:

@@ -95,6 +95,7 @@ def report(out, one_seed):
     codes = [
         main([*four, str(out / "four")]),
         main(["--phase", "zero-shot", "--from", str(one_seed), *runs.REFIT]),
+        main(["--phase", "zero-shot", "--from", str(one_seed), *runs.ACTOR]),
     ]
     spread_over, said = acting_program([*four, str(out / "four")])
     flags = ["--tiny", "--precision", "f32", "--repeats", "2", "--devices", "2", "64"]

@@ -26,6 +26,11 @@ EXPLORED = ("--phase", "explore", "--preset", "smoke", "--engine", "mujoco")
 LAST, STEPS = 3, 20
 FOUR = (3, 2, 1, 0)  # seeds; alone, the last of them is a run that files share
 REFIT = ("--refit.num-epochs", "1", "--refit.batch-size", "16")
+ACTOR = (
+    *REFIT, "--tag", "actor", "--critic.acts",
+    "--critic.num-updates", "20", "--critic.hidden-size", "16",
+    "--critic.batch-size", "8",
+)  # fmt: skip
 
 
 def start(*command, devices=1, variables=()):

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import math
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -15,10 +16,12 @@ import pytest
 import runs
 
 from experiments.parallel import devices
+from experiments.run import main
 from experiments.storage import checkpoint
 
 SCRIPT = Path(__file__).with_name("on_four_devices.py")
 TASKS = "zero-shot-003"
+ACTOR = "zero-shot-003-actor"
 
 
 @pytest.mark.parametrize(
@@ -103,7 +106,7 @@ def found(explored_copy, performed_once, tmp_path_factory):
     said, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     seen = json.loads(said.splitlines()[-1])
-    assert seen["codes"] == [0, 0], errors
+    assert seen["codes"] == [0, 0, 0], errors
     assert seen["devices"] == 4
     four_then_one = runs.unfinished(four, out / "four-one")
     with contextlib.redirect_stderr(io.StringIO()) as then:
@@ -169,6 +172,20 @@ def test_tasks_of_one_seed_are_spread(found):
         close(row, other, rel=1e-2, abs=1e-2)
     paths = [np.load(folder / "trajectories.npz") for folder in (spread, here)]
     assert paths[0]["obs"].shape == paths[1]["obs"].shape == (1, 4, 1, runs.STEPS, 18)
+
+
+@pytest.mark.slow
+def test_the_actors_of_tasks_are_spread(found, tmp_path):
+    """A task a device: what its actor learns, and then earns, is as on one device."""
+    here = tmp_path / runs.NAME
+    shutil.copytree(found.alone, here)
+    shutil.rmtree(here / ACTOR)
+    assert main(["--phase", "zero-shot", "--from", str(here), *runs.ACTOR]) == 0
+    for row, other in zip(
+        runs.rows(found.alone / ACTOR), runs.rows(here / ACTOR), strict=True
+    ):
+        assert row["task"] == other["task"]
+        close(row, other, rel=1e-2, abs=1e-2)
 
 
 @pytest.mark.slow
