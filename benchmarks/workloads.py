@@ -17,6 +17,8 @@ from jax import Array
 
 import jaxpets
 from experiments.cost import model_flops
+from jaxpets._src.fused_rollout import rollout_of_kind
+from jaxpets._src.kernel.build import Kind
 from jaxpets.envs import half_cheetah
 
 
@@ -33,7 +35,8 @@ class Size:
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
 
 
-ENGINES = ("scan", "kernel")
+# "mma" is the kernel for all GPUs, also where "kernel" is the one for Hopper.
+ENGINES = ("scan", "kernel", "mma")
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
@@ -117,12 +120,20 @@ def rollout_fn(
         )
     if jax.default_backend() == "cpu" and precision != "f32":
         raise SystemExit("no kernel to time: that of a CPU is --precision f32 only")
-    fused = jaxpets.fused_rollout(
-        model(size, precision), num_particles=size.num_particles
-    )
+    own, num_particles = model(size, precision), size.num_particles
+    if engine == "mma":
+        fused = rollout_of_kind(own, num_particles, Kind.MMA)
+    else:
+        fused = jaxpets.fused_rollout(own, num_particles=num_particles)
     if not fused.uses_kernel:
         raise SystemExit(f"no kernel to time: {fused.reason}")
     return fused
+
+
+def arch(size: Size, precision: str, engine: str) -> str:
+    """Returns for which GPU the kernel was built, as nvcc calls it, or nothing."""
+    rollout = rollout_fn(size, precision, engine)
+    return rollout.arch if isinstance(rollout, jaxpets.typing.FusedRollout) else ""
 
 
 def rollout_work(
@@ -142,7 +153,7 @@ def optimizer(
 ) -> jaxpets.optimizers.TrajectoryOptimizer:
     """Returns `cem` or `icem` at this size, as the experiment has it for the engine."""
     one = jnp.ones((half_cheetah.ACTION_SIZE,), jnp.float32)
-    unroll = engine == "kernel" and jax.default_backend() == "gpu"
+    unroll = engine != "scan" and jax.default_backend() == "gpu"
     cem = functools.partial(jaxpets.optimizers.cem, unroll=unroll)
     build = {"cem": cem, "icem": jaxpets.optimizers.icem}[name]
     return build(
