@@ -132,7 +132,7 @@ class PlannerConfig:
     Training always uses tf32 or better."""
     fused: bool = True
     """Imagine in one kernel, where there can be one: on CPUs with a C++ compiler,
-    which takes float32 whatever the precision; on an H100 or H200 with bf16."""
+    which takes float32 whatever the precision; on NVIDIA GPUs from Ampere on with bf16."""
 
 
 @dataclasses.dataclass(frozen=True)
