@@ -17,8 +17,6 @@ from jax import Array
 
 import jaxpets
 from experiments.cost import model_flops
-from jaxpets._src.fused_rollout import rollout_of_kind
-from jaxpets._src.kernel.build import Kind
 from jaxpets.envs import half_cheetah
 
 
@@ -35,8 +33,8 @@ class Size:
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
 
 
-# "mma" is the kernel for all GPUs, also where "kernel" is the one for Hopper.
-ENGINES = ("scan", "kernel", "mma")
+# "sm_90" is the kernel that other GPUs have, on Hopper, which has one of its own.
+ENGINES = ("scan", "kernel", "sm_90")
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
@@ -120,11 +118,10 @@ def rollout_fn(
         )
     if jax.default_backend() == "cpu" and precision != "f32":
         raise SystemExit("no kernel to time: that of a CPU is --precision f32 only")
-    own, num_particles = model(size, precision), size.num_particles
-    if engine == "mma":
-        fused = rollout_of_kind(own, num_particles, Kind.MMA)
-    else:
-        fused = jaxpets.fused_rollout(own, num_particles=num_particles)
+    arch = "sm_90" if engine == "sm_90" else None
+    fused = jaxpets.fused_rollout(
+        model(size, precision), num_particles=size.num_particles, arch=arch
+    )
     if not fused.uses_kernel:
         raise SystemExit(f"no kernel to time: {fused.reason}")
     return fused

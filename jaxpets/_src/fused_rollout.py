@@ -26,6 +26,8 @@ from jaxpets._src.network import Precision
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import ModelSpace
 
+# Hopper's instructions for a warpgroup are in this variant alone.
+_HOPPER = "sm_90a"
 _LAYOUTS = {"wgmma": WgmmaLayout, "mma": MmaLayout, "cpu": CpuLayout}
 
 
@@ -59,7 +61,9 @@ class FusedRollout:
         return self.bind(params)(key, obs, actions)
 
 
-def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
+def fused_rollout(
+    model: Ensemble, *, num_particles: int, arch: str | None = None
+) -> FusedRollout:
     """Builds the particle rollout of an ensemble as one kernel, for GPUs and CPUs.
 
     It computes what `particle_rollout(model.sample, ...)` does, with the same noise for
@@ -90,22 +94,33 @@ def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
       model: as `jaxpets.ensemble` built it. The kernel is made from its config and
         space: a `sample` of your own in their place would not be seen.
       num_particles: E * P, over all members.
+      arch: for which GPU, as nvcc calls it: `sm_90` is for Hopper without instructions
+        of its own, `sm_90a` with them. None for the first device's.
 
     Returns:
       A FusedRollout whose params are the ensemble's, and whose start is `[D]`.
 
     Raises:
       TypeError: if model is no Ensemble.
-      ValueError: if model was not built by `jaxpets.ensemble`, or num_particles is not
-        a multiple of the number of members.
+      ValueError: if model was not built by `jaxpets.ensemble`, num_particles is not a
+        multiple of the number of members, or arch is not the name of a GPU.
     """
-    rollout = rollout_of_kind(model, num_particles, _kind_for(jax.devices()[0]))
+    kind = _kind_for(jax.devices()[0])
+    if arch is not None:
+        if not re.fullmatch(r"sm_\d+a?", str(arch)):
+            raise ValueError(
+                f"arch must be the name of a GPU, as sm_90a, got {arch!r}."
+            )
+        kind = Kind.WGMMA if arch == _HOPPER else Kind.MMA
+    rollout = rollout_of_kind(model, num_particles, kind, arch)
     if not rollout.uses_kernel:
         warnings.warn(f"fused_rollout runs as a scan: {rollout.reason}.", stacklevel=2)
     return rollout
 
 
-def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRollout:
+def rollout_of_kind(
+    model: Ensemble, num_particles: int, kind: Kind, arch: str | None = None
+) -> FusedRollout:
     """Builds a `fused_rollout` with one kind of kernel, and does not warn of a scan."""
     config, space = _origin(model)
     scan = particle_rollout(
@@ -113,7 +128,8 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
     )
     try:
         layout = _layout(model, config, space, kind)
-        arch = _arch(jax.devices()[0], kind) if kind.is_for_gpu else ""
+        if arch is None:
+            arch = _arch(jax.devices()[0], kind) if kind.is_for_gpu else ""
         kernel = load_kernel(_model_header(config, space, layout, kind), kind, arch)
     except (BuildError, UnsupportedError) as error:
         return FusedRollout(lambda params: functools.partial(scan, params), str(error))
@@ -242,8 +258,7 @@ def _arch(device: Any, kind: Kind) -> str:
         raise UnsupportedError(
             f"the GPU's compute capability is {seen}, not 8.0 or more"
         )
-    # Hopper's instructions for a warpgroup are in its variant "a" alone.
-    return f"sm_{major}{minor}{'a' if kind is Kind.WGMMA else ''}"
+    return _HOPPER if kind is Kind.WGMMA else f"sm_{major}{minor}"
 
 
 def _capability(device: Any) -> tuple[int, int]:

@@ -11,6 +11,8 @@ import pytest
 from conftest import SOURCES
 from rollouts import CASES, CHEETAH, SMALL, recorded, relative_error, stacked
 
+import jaxpets
+from jaxpets import Precision
 from jaxpets._src import fused_rollout as module
 from jaxpets._src.kernel.build import Kernel, Kind
 
@@ -74,6 +76,19 @@ def test_a_gpu_has_the_kernel_that_was_written_for_it(
     # The same model, with the instructions it needs.
     assert kernel.startswith(plain) and "wgmma" not in plain
     assert ("wgmma.mma_async" in kernel) == (kind is Kind.WGMMA)
+
+
+def test_a_gpu_may_be_named(monkeypatch, asked):
+    """Hopper without its own instructions; or one that is not here."""
+    pretend(monkeypatch, compute_capability="9.0")
+    model, particles = SMALL.model(Precision.BF16), SMALL.num_members
+    for arch, kind in (("sm_90", Kind.MMA), ("sm_90a", Kind.WGMMA)):
+        fused = jaxpets.fused_rollout(model, num_particles=particles, arch=arch)
+        assert fused.arch == arch and asked.pop()[1:] == (kind, arch)
+    with pytest.raises(
+        ValueError, match=r"^arch must be the name of a GPU, .* got '9'"
+    ):
+        jaxpets.fused_rollout(model, num_particles=particles, arch="9")
 
 
 def test_both_kernels_compute_the_same():
