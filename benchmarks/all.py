@@ -14,7 +14,7 @@ SET = (
     (env, "--batch 1 4 16 64 256 4096"),
     # Last: these end where no kernel runs, or where there is no GPU.
     (plan, "--engine scan kernel --seeds 1 4 16"),
-    (plan, "--engine scan kernel --seeds 1 4 16 --plans 10"),
+    (plan, "--engine scan kernel sm_90 --seeds 1 4 16 --plans 10"),
     (plan, "--engine scan kernel --seeds 1 --num-samples 125 250 1000 2000 4000 8000"),
     (trace, "--seeds 1 4 16"),
 )

@@ -77,6 +77,7 @@ def measure(
         dtype=precision,
         seeds=seeds,
         engine=engine,
+        arch=workloads.arch(size, precision, engine),
         ms_per_plan=result.median_ms / plans,
         **result._asdict(),
         gflop=flops / 1e9,

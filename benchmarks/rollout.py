@@ -22,6 +22,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         yield rows.make_row(
             "rollout",
             {**dataclasses.asdict(size), "precision": precision, "engine": engine},
+            arch=workloads.arch(size, precision, engine),
             **result._asdict(),
             us_per_step=1e3 * result.median_ms / size.horizon,
             tflops_per_s=flops / result.median_ms / 1e9,

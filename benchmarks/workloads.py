@@ -33,7 +33,8 @@ class Size:
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
 
 
-ENGINES = ("scan", "kernel")
+# "sm_90" is the kernel that other GPUs have, on Hopper, which has one of its own.
+ENGINES = ("scan", "kernel", "sm_90")
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
@@ -117,12 +118,19 @@ def rollout_fn(
         )
     if jax.default_backend() == "cpu" and precision != "f32":
         raise SystemExit("no kernel to time: that of a CPU is --precision f32 only")
+    arch = "sm_90" if engine == "sm_90" else None
     fused = jaxpets.fused_rollout(
-        model(size, precision), num_particles=size.num_particles
+        model(size, precision), num_particles=size.num_particles, arch=arch
     )
     if not fused.uses_kernel:
         raise SystemExit(f"no kernel to time: {fused.reason}")
     return fused
+
+
+def arch(size: Size, precision: str, engine: str) -> str:
+    """Returns for which GPU the kernel was built, as nvcc calls it, or nothing."""
+    rollout = rollout_fn(size, precision, engine)
+    return rollout.arch if isinstance(rollout, jaxpets.typing.FusedRollout) else ""
 
 
 def rollout_work(
@@ -142,7 +150,7 @@ def optimizer(
 ) -> jaxpets.optimizers.TrajectoryOptimizer:
     """Returns `cem` or `icem` at this size, as the experiment has it for the engine."""
     one = jnp.ones((half_cheetah.ACTION_SIZE,), jnp.float32)
-    unroll = engine == "kernel" and jax.default_backend() == "gpu"
+    unroll = engine != "scan" and jax.default_backend() == "gpu"
     cem = functools.partial(jaxpets.optimizers.cem, unroll=unroll)
     build = {"cem": cem, "icem": jaxpets.optimizers.icem}[name]
     return build(

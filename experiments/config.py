@@ -132,7 +132,7 @@ class PlannerConfig:
     Training always uses tf32 or better."""
     fused: bool = True
     """Imagine in one kernel, where there can be one: on CPUs with a C++ compiler,
-    which takes float32 whatever the precision; on an H100 or H200 with bf16."""
+    which takes float32 whatever the precision; with bf16 on GPUs from Ampere on."""
 
 
 @dataclasses.dataclass(frozen=True)

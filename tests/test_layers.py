@@ -36,6 +36,8 @@ LAYERS = {
     "_src.kernel.primitives": 1,
     "_src.kernel.jaxpr_to_cpp": 2,
     "_src.kernel.gpu_layout": 1,
+    "_src.kernel.wgmma_layout": 2,
+    "_src.kernel.mma_layout": 2,
     "_src.kernel.cpu_layout": 1,
     "_src.plan": 2,
     "_src.cem": 2,

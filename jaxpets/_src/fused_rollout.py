@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -19,9 +20,15 @@ from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
 from jaxpets._src.kernel.cpu_layout import CpuLayout
 from jaxpets._src.kernel.gpu_layout import GpuLayout
 from jaxpets._src.kernel.jaxpr_to_cpp import UnsupportedError, cpp_function
+from jaxpets._src.kernel.mma_layout import MmaLayout
+from jaxpets._src.kernel.wgmma_layout import WgmmaLayout
 from jaxpets._src.network import Precision
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import ModelSpace
+
+# Hopper's instructions for a warpgroup are in this variant alone.
+_HOPPER = "sm_90a"
+_LAYOUTS = {"wgmma": WgmmaLayout, "mma": MmaLayout, "cpu": CpuLayout}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,11 +41,13 @@ class FusedRollout:
       reason: why the scan runs and no kernel; empty if the kernel does.
       compiler: name and version of the compiler of the kernel; empty if the scan runs.
         With another one, or on another processor, the last bits may be others.
+      arch: of the GPU that the kernel was built for, as nvcc calls it; else empty.
     """
 
     bind: Callable[[EnsembleParams], Callable[[Array, Array, Array], Array]]
     reason: str = ""
     compiler: str = ""
+    arch: str = ""
 
     @property
     def uses_kernel(self) -> bool:
@@ -52,8 +61,10 @@ class FusedRollout:
         return self.bind(params)(key, obs, actions)
 
 
-def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
-    """Builds the particle rollout of an ensemble as one kernel, for H100s and CPUs.
+def fused_rollout(
+    model: Ensemble, *, num_particles: int, arch: str | None = None
+) -> FusedRollout:
+    """Builds the particle rollout of an ensemble as one kernel, for GPUs and CPUs.
 
     It computes what `particle_rollout(model.sample, ...)` does, with the same noise for
     the same key. On a CPU products read and add up float32, whatever the precision. On
@@ -71,8 +82,8 @@ def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
       model here, in seconds, and kept in the user's cache folder;
     - keys are not of JAX's default kind, partitionable threefry (only a call can know:
       it warns);
-    - the device is neither a CPU nor a GPU of compute capability 9.0 (H100, H200,
-      GH200);
+    - the device is neither a CPU nor a GPU of compute capability 8.0 or later (A100,
+      RTX 30 and later). Those of 9.0 (H100, H200, GH200) have a kernel of their own;
     - on a GPU, the precision is not BF16, a hidden layer has more than 256 units, an
       observation more than 128 entries, or features and action together more than 256.
 
@@ -83,23 +94,33 @@ def fused_rollout(model: Ensemble, *, num_particles: int) -> FusedRollout:
       model: as `jaxpets.ensemble` built it. The kernel is made from its config and
         space: a `sample` of your own in their place would not be seen.
       num_particles: E * P, over all members.
+      arch: for which GPU, as nvcc calls it: `sm_90` is for Hopper without instructions
+        of its own, `sm_90a` with them. None for the first device's.
 
     Returns:
       A FusedRollout whose params are the ensemble's, and whose start is `[D]`.
 
     Raises:
       TypeError: if model is no Ensemble.
-      ValueError: if model was not built by `jaxpets.ensemble`, or num_particles is not
-        a multiple of the number of members.
+      ValueError: if model was not built by `jaxpets.ensemble`, num_particles is not a
+        multiple of the number of members, or arch is not the name of a GPU.
     """
     kind = _kind_for(jax.devices()[0])
-    rollout = rollout_of_kind(model, num_particles, kind)
+    if arch is not None:
+        if not re.fullmatch(r"sm_\d+a?", str(arch)):
+            raise ValueError(
+                f"arch must be the name of a GPU, as sm_90a, got {arch!r}."
+            )
+        kind = Kind.WGMMA if arch == _HOPPER else Kind.MMA
+    rollout = rollout_of_kind(model, num_particles, kind, arch)
     if not rollout.uses_kernel:
         warnings.warn(f"fused_rollout runs as a scan: {rollout.reason}.", stacklevel=2)
     return rollout
 
 
-def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRollout:
+def rollout_of_kind(
+    model: Ensemble, num_particles: int, kind: Kind, arch: str | None = None
+) -> FusedRollout:
     """Builds a `fused_rollout` with one kind of kernel, and does not warn of a scan."""
     config, space = _origin(model)
     scan = particle_rollout(
@@ -107,7 +128,9 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
     )
     try:
         layout = _layout(model, config, space, kind)
-        kernel = load_kernel(_model_header(config, space, layout, kind), kind)
+        if arch is None:
+            arch = _arch(jax.devices()[0], kind) if kind.is_for_gpu else ""
+        kernel = load_kernel(_model_header(config, space, layout, kind), kind, arch)
     except (BuildError, UnsupportedError) as error:
         return FusedRollout(lambda params: functools.partial(scan, params), str(error))
 
@@ -134,7 +157,7 @@ def rollout_of_kind(model: Ensemble, num_particles: int, kind: Kind) -> FusedRol
 
         return rollout
 
-    return FusedRollout(bind, compiler=kernel.compiler)
+    return FusedRollout(bind, compiler=kernel.compiler, arch=arch)
 
 
 def _origin(model: Ensemble) -> tuple[EnsembleConfig, ModelSpace]:
@@ -159,15 +182,13 @@ def _layout(
     """
     features = space.features(jnp.zeros((model.obs_size,), jnp.float32))
     sizes = (model.obs_size, model.action_size, features.shape[-1], config.hidden_sizes)
-    if kind is Kind.CPU:
-        return CpuLayout(*sizes)
-    layout = GpuLayout(*sizes)
+    layout = _LAYOUTS[kind.layout](*sizes)
+    if isinstance(layout, CpuLayout):
+        return layout
     if config.precision is not Precision.BF16:
         raise UnsupportedError(f"the precision is {config.precision.value}, not bf16")
     if problem := layout.problem():
         raise UnsupportedError(problem)
-    if kind is Kind.GPU:
-        _check_device(jax.devices()[0])
     return layout
 
 
@@ -197,7 +218,7 @@ def _model_header(
         }
         code.append(cpp_function(name, function, rows, called))
     header = ['#pragma once\n#include "particle.h"', layout.header(), *code]
-    if kind is Kind.GPU and isinstance(layout, GpuLayout):
+    if kind.is_for_gpu and isinstance(layout, GpuLayout):
         header.append(layout.products())
     return "\n".join(header)
 
@@ -218,15 +239,31 @@ def _check_result(
 
 
 def _kind_for(device: Any) -> Kind:
-    return Kind.CPU if device.platform == "cpu" else Kind.GPU
+    if device.platform == "cpu":
+        return Kind.CPU
+    return Kind.WGMMA if _capability(device) == (9, 0) else Kind.MMA
 
 
-def _check_device(device: Any) -> None:
+def _arch(device: Any, kind: Kind) -> str:
+    """Returns what nvcc calls a GPU.
+
+    Raises:
+      UnsupportedError: if it is none that a kernel was written for.
+    """
     if device.platform != "gpu":
         raise UnsupportedError(f"the device is a {device.platform}, not a GPU or CPU")
-    capability = getattr(device, "compute_capability", "unknown")
-    if capability != "9.0":
-        raise UnsupportedError(f"the GPU's compute capability is {capability}, not 9.0")
+    major, minor = _capability(device)
+    if major < 8:
+        seen = getattr(device, "compute_capability", "unknown")
+        raise UnsupportedError(
+            f"the GPU's compute capability is {seen}, not 8.0 or more"
+        )
+    return _HOPPER if kind is Kind.WGMMA else f"sm_{major}{minor}"
+
+
+def _capability(device: Any) -> tuple[int, int]:
+    seen = re.fullmatch(r"(\d+)\.(\d)", getattr(device, "compute_capability", ""))
+    return (int(seen[1]), int(seen[2])) if seen else (0, 0)
 
 
 def _is_counted(key: Array) -> bool:

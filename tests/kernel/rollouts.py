@@ -21,12 +21,13 @@ from jaxpets.envs.observations import readings
 _real = build._compiler
 
 
-def _plain_compiler(kind):
+def _plain_compiler(kind, arch=""):
     """Optimises little, as these kernels run once: it saves half of the time.
 
     Runs of the experiments, in processes of their own, have kernels as a user has.
     """
-    return _real(kind) if kind is Kind.GPU else [*_real(kind), "-O1"]
+    command = _real(kind, arch)
+    return command if kind.is_for_gpu else [*command, "-O1"]
 
 
 # In every process that imports this: all of them are to build the same kernels.
@@ -220,7 +221,7 @@ class Engine:
 # The GPU's kernel multiplies float16 numbers, the scan float32 ones: every layer
 # rounds its inputs and weights by up to 2^-12 of themselves. Errors of many terms
 # cancel; those of H steps add up, but so do the moves they are compared with.
-REFERENCE = Engine(Kind.GPU_REFERENCE, 2e-4)
+REFERENCE = Engine(Kind.WGMMA_REFERENCE, 2e-4)
 # The CPU's kernel differs from the scan by the order of its sums, and by functions that
 # are right to two units in the last place, 1e-7: measured 5e-8 to 2e-7 in all.
 CPU = Engine(Kind.CPU, 1e-6)

@@ -62,7 +62,7 @@ def test_on_other_devices_it_is_the_scan(monkeypatch, precision):
 @pytest.mark.parametrize("precision", [Precision.F32, Precision.TF32])
 def test_other_precisions_are_the_scan_on_a_gpu(precision):
     words = f"the precision is {precision.value}, not bf16"
-    fused = SMALL.of_kind(Kind.GPU_REFERENCE, precision)
+    fused = SMALL.of_kind(Kind.WGMMA_REFERENCE, precision)
     assert_is_the_scan(fused, SMALL, words, precision)
 
 
@@ -80,7 +80,7 @@ def test_other_precisions_are_the_scan_on_a_gpu(precision):
 )
 def test_what_is_too_large_is_the_scan_on_a_gpu(change, words):
     case = dataclasses.replace(SMALL, **change)
-    assert_is_the_scan(case.of_kind(Kind.GPU_REFERENCE), case, words)
+    assert_is_the_scan(case.of_kind(Kind.WGMMA_REFERENCE), case, words)
 
 
 NEVER = dataclasses.replace(SMALL, hidden_sizes=(40,))  # never built
@@ -119,7 +119,7 @@ def test_coordinates_that_only_a_bound_makes_fit_are_the_scan(size):
         bound=lambda obs, low, high: jnp.clip(obs[..., -3:], low, high),
     )
     case = dataclasses.replace(SMALL, space=space)
-    fused = case.of_kind(Kind.GPU_REFERENCE)
+    fused = case.of_kind(Kind.WGMMA_REFERENCE)
     assert_is_the_scan(fused, case, f"next_obs makes [{size}] of [3]")
 
 

@@ -59,7 +59,7 @@ def test_a_bound_that_is_not_asked_for_is_not_applied():
     programs = {
         str(jax.make_jaxpr(REFERENCE.fused(x))(*case.avals())) for x in (case, other)
     }
-    assert len(programs) == 1 and "jaxpets_rollout_gpu_reference_" in programs.pop()
+    assert len(programs) == 1 and "jaxpets_rollout_wgmma_reference_" in programs.pop()
 
 
 # Noise.
@@ -215,7 +215,7 @@ def test_a_model_that_is_not_of_jaxpets_is_refused():
 def test_operands_of_another_model_are_refused():
     """What Python has checked is checked again where memory is read."""
     program = str(jax.make_jaxpr(REFERENCE.fused(SMALL))(*SMALL.avals()))
-    (target,) = re.findall("jaxpets_rollout_gpu_reference_[0-9a-f]+", program)
+    (target,) = re.findall("jaxpets_rollout_wgmma_reference_[0-9a-f]+", program)
     path = jax.eval_shape(SMALL.scan(), *SMALL.avals())
     operands = [jnp.zeros((3, 1))] * 5
     for count, words in (

@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 from layers import layers_of
 
-from jaxpets._src.kernel.gpu_layout import SHARED_MEMORY, GpuLayout
+from jaxpets._src.kernel import mma_layout
+from jaxpets._src.kernel.mma_layout import MmaLayout
+from jaxpets._src.kernel.wgmma_layout import SHARED_MEMORY, WgmmaLayout
 
-SMALL = GpuLayout(obs_size=5, action_size=2, feature_size=7, hidden_sizes=(20, 33))
-PAPER = GpuLayout(18, 6, 18, (200, 200, 200, 200))
-LAYOUTS = {
-    "small": SMALL,
-    "one layer": GpuLayout(1, 1, 1, (1,)),
-    "paper": PAPER,
-    "narrow first": GpuLayout(3, 2, 4, (8, 64, 24)),
-    "full chunks": GpuLayout(8, 6, 8, (30, 30)),  # 14 inputs and two biases
+SIZES = {
+    "small": (5, 2, 7, (20, 33)),
+    "one layer": (1, 1, 1, (1,)),
+    "paper": (18, 6, 18, (200, 200, 200, 200)),
+    "narrow first": (3, 2, 4, (8, 64, 24)),
+    "full chunks": (8, 6, 8, (30, 30)),  # 14 inputs and two biases
 }
+WGMMA = {f"wgmma {name}": WgmmaLayout(*sizes) for name, sizes in SIZES.items()}
+LAYOUTS = WGMMA | {f"mma {name}": MmaLayout(*sizes) for name, sizes in SIZES.items()}
+SMALL, PAPER = WGMMA["wgmma small"], WGMMA["wgmma paper"]
 
 
 def unpacked(numbers, rows, columns):
@@ -43,7 +46,8 @@ def test_parameters_lie_as_documented(name):
     assert packed.dtype == jnp.float16
     rest = np.float64(packed)
     width, left, head = layout.width, layout.left, layout.head
-    assert 0 < width - left <= left
+    cut = isinstance(layout, WgmmaLayout)
+    assert 0 < width - left <= left if cut else left == width
     rows = [layout.input_size] + [width] * len(layout.hidden_sizes)
     for i, (layer, size) in enumerate(zip(layers, rows, strict=True)):
         kernel, bias = (np.float64(layer[name]) for name in ("kernel", "bias"))
@@ -107,7 +111,7 @@ def test_members_do_not_mix():
 
 
 def bytes_of(layout, streaming):
-    """Shared memory as gpu_rollout.cu declares it."""
+    """Shared memory as wgmma_rollout.cu declares it."""
     inputs = -(-(layout.input_size + 2) // 16)
     hidden = -(-(layout.width + 2) // 16)
     right = layout.width - layout.left
@@ -131,7 +135,7 @@ def test_every_model_that_is_accepted_fits_into_shared_memory():
     for width in (1, 24, 25, 32, 64, 100, 128, 200, 240, 256):
         for depth in (1, 2, 4, 8):
             for obs_size, inputs in ((1, 1), (8, 4), (18, 6), (47, 30), (128, 128)):
-                layout = GpuLayout(obs_size, inputs, obs_size, (width,) * depth)
+                layout = WgmmaLayout(obs_size, inputs, obs_size, (width,) * depth)
                 streaming = layout.streaming()
                 if streaming is None:
                     assert layout.problem() is not None
@@ -164,27 +168,44 @@ def test_a_small_model_stays_in_shared_memory():
     assert PAPER.streaming().left > 0
 
 
+TOO_LARGE = "the model does not fit into the GPU's shared memory"
+
+
+@pytest.mark.parametrize("layout", [WgmmaLayout, MmaLayout])
 @pytest.mark.parametrize(
-    ("layout", "problem"),
+    ("sizes", "problem"),
     [
-        (GpuLayout(18, 6, 18, (256, 8)), None),
-        (GpuLayout(18, 6, 18, ()), "there is no hidden layer"),
-        (GpuLayout(18, 6, 18, (8, 257)), "hidden layers are wider than 256"),
-        (GpuLayout(128, 6, 18, (64,)), None),
-        (GpuLayout(129, 6, 18, (64,)), "observations have more than 128 entries"),
-        (GpuLayout(18, 56, 200, (64,)), None),
-        (
-            GpuLayout(18, 57, 200, (64,)),
-            "features and action have more than 256 entries",
-        ),
-        (
-            GpuLayout(128, 128, 128, (256,)),
-            "the model does not fit into the GPU's shared memory",
-        ),
+        ((18, 6, 18, (256, 8)), None),
+        ((18, 6, 18, ()), "there is no hidden layer"),
+        ((18, 6, 18, (8, 257)), "hidden layers are wider than 256"),
+        ((128, 6, 18, (64,)), None),
+        ((129, 6, 18, (64,)), "observations have more than 128 entries"),
+        ((18, 56, 200, (64,)), None),
+        ((18, 57, 200, (64,)), "features and action have more than 256 entries"),
+        ((128, 128, 128, (256,)), TOO_LARGE),
     ],
 )
-def test_what_is_too_large_is_said(layout, problem):
-    assert layout.problem() == problem
+def test_what_is_too_large_is_said(layout, sizes, problem):
+    assert layout(*sizes).problem() == problem
+
+
+def test_two_blocks_share_a_multiprocessor_of_any_gpu_if_they_can():
+    """Of 100 KiB, and CUDA takes one for each block."""
+    slots = {}
+    for name, sizes in [*SIZES.items(), ("quadruped", (60, 12, 63, (256,) * 4))]:
+        layout = MmaLayout(*sizes)
+        slots[name] = layout.ring()["SLOTS"]
+        fits = layout.shared_bytes(slots[name]) <= 49 * 1024
+        assert fits or slots[name] == 3
+        assert layout.shared_bytes(slots[name]) <= mma_layout.SHARED_MEMORY
+    assert slots == {
+        "small": 6,
+        "one layer": 6,
+        "paper": 5,
+        "narrow first": 6,
+        "full chunks": 6,
+        "quadruped": 3,
+    }
 
 
 def test_the_header_has_every_constant():
@@ -197,6 +218,7 @@ def test_the_header_has_every_constant():
         "FEATURES": 18,
         "WIDTH": 200,
         "LAYERS": 4,
+        "LEFT": 112,
         "LEFT_STREAMED": streaming.left,
         "RIGHT_STREAMED": streaming.right,
         "UNIT": streaming.unit,
@@ -204,7 +226,7 @@ def test_the_header_has_every_constant():
     }
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("name", WGMMA)
 def test_one_instruction_for_each_width_of_products(name):
     layout = LAYOUTS[name]
     text = layout.products()
@@ -225,7 +247,7 @@ def test_one_instruction_for_each_width_of_products(name):
 
 
 def consumer(streaming, layers, steps):
-    """What a consumer of gpu_rollout.cu does with the ring and its turns, in order."""
+    """What a consumer of wgmma_rollout.cu does with the ring and its turns."""
     fits = streaming.left + streaming.right <= streaming.unit * streaming.slots
     done, unit = [], 0
     for _ in range(steps):
@@ -280,7 +302,7 @@ def test_consumers_and_producer_never_wait_for_each_other():
     seen = set()
     for width in range(8, 257, 8):
         for layers in (1, 2, 4, 8):
-            streaming = GpuLayout(18, 6, 18, (width,) * layers).streaming()
+            streaming = WgmmaLayout(18, 6, 18, (width,) * layers).streaming()
             if streaming is None:
                 continue
             assert finishes(streaming, layers, tiles=1)

@@ -29,12 +29,12 @@ def kept(cache):
 
 def test_one_compilation_per_model(cache, compiler, making, registered):
     compiler(making.script)
-    target, _ = load("// one", Kind.GPU_REFERENCE)
+    target, _ = load("// one", Kind.WGMMA_REFERENCE)
     assert (
-        load("// one", Kind.GPU_REFERENCE).target == target
+        load("// one", Kind.WGMMA_REFERENCE).target == target
     )  # as the next process does
     assert len(making.commands) == 1
-    other, _ = load("// two", Kind.GPU_REFERENCE)
+    other, _ = load("// two", Kind.WGMMA_REFERENCE)
     assert other != target and len(making.commands) == 2
     assert registered == [(name, "cpu") for name in (target, target, other)]
     assert sorted(kept(cache)) == sorted([target, other])
@@ -42,13 +42,13 @@ def test_one_compilation_per_model(cache, compiler, making, registered):
 
 def test_a_process_asks_once(compiler, making, registered):
     compiler(making.script)
-    build.load_kernel("// asked twice", Kind.GPU_REFERENCE)
-    target, _ = build.load_kernel("// asked twice", Kind.GPU_REFERENCE)
+    build.load_kernel("// asked twice", Kind.WGMMA_REFERENCE)
+    target, _ = build.load_kernel("// asked twice", Kind.WGMMA_REFERENCE)
     assert len(making.commands) == 1 and registered == [(target, "cpu")]
-    assert target.startswith("jaxpets_rollout_gpu_reference_")
+    assert target.startswith("jaxpets_rollout_wgmma_reference_")
 
 
-@pytest.mark.parametrize("kind", [Kind.CPU, Kind.GPU_REFERENCE])
+@pytest.mark.parametrize("kind", [Kind.CPU, Kind.WGMMA_REFERENCE])
 @pytest.mark.parametrize("change", ["sources", "jax", "compiler", "version"])
 def test_another_recipe_is_another_kernel(
     monkeypatch, tmp_path, compiler, making, change, kind
@@ -73,8 +73,9 @@ def test_another_recipe_is_another_kernel(
 @pytest.mark.parametrize(
     ("kind", "program", "source", "registry"),
     [
-        (Kind.GPU, "nvcc", "gpu_rollout.cu", "CUDA"),
-        (Kind.GPU_REFERENCE, "c++", "gpu_reference.cc", "cpu"),
+        (Kind.WGMMA, "nvcc", "wgmma_rollout.cu", "CUDA"),
+        (Kind.MMA, "nvcc", "mma_rollout.cu", "CUDA"),
+        (Kind.WGMMA_REFERENCE, "c++", "gpu_reference.cc", "cpu"),
         (Kind.CPU, "c++", "cpu_rollout.cc", "cpu"),
     ],
 )
@@ -95,10 +96,10 @@ def test_every_kind_is_a_library_of_its_own(
 def test_a_processor_has_a_library_of_its_own(compiler, making):
     """Where machines share a folder; the reference is for all of them."""
     compiler(making.script)
-    own, shared = load("// one", Kind.CPU), load("// one", Kind.GPU_REFERENCE)
+    own, shared = load("// one", Kind.CPU), load("// one", Kind.WGMMA_REFERENCE)
     compiler(making.script, processor="echo '#define __MORE__ 1'")
     assert load("// one", Kind.CPU) != own
-    assert load("// one", Kind.GPU_REFERENCE) == shared
+    assert load("// one", Kind.WGMMA_REFERENCE) == shared
     assert len(making.commands) == 3
 
 
@@ -115,7 +116,7 @@ def test_a_cpu_is_built_for_by_its_name(monkeypatch, compiler, making, machine, 
     monkeypatch.setattr(platform, "machine", lambda: machine)
     compiler(making.script)
     load("// one", Kind.CPU)
-    load("// one", Kind.GPU_REFERENCE)
+    load("// one", Kind.WGMMA_REFERENCE)
     command, reference = making.commands
     assert flag in command and "-O3" in command
     assert command.index("-O3") > command.index("-O2")  # the last one counts
@@ -129,7 +130,7 @@ def test_all_sources_are_given_to_the_compiler(tmp_path, compiler):
         f'echo "$*" > {given}/command; exit 1'
     )
     with pytest.raises(BuildError, match="failed: no message"):
-        load("// the model", Kind.GPU_REFERENCE)
+        load("// the model", Kind.WGMMA_REFERENCE)
     command = (given / "command").read_text().split()
     folder = Path(command[-1]).parent
     assert f"-I{folder}" in command and f"-I{jax.ffi.include_dir()}" in command
@@ -157,7 +158,7 @@ def test_without_any_folder_it_says_so(monkeypatch, cache, compiler, making):
         pytest.warns(UserWarning, match="^cannot keep a compiled kernel"),
         pytest.raises(BuildError, match=words),
     ):
-        load("// one", Kind.GPU_REFERENCE)
+        load("// one", Kind.WGMMA_REFERENCE)
 
 
 def test_a_temporary_library_is_gone_when_it_is_loaded(
@@ -169,7 +170,7 @@ def test_a_temporary_library_is_gone_when_it_is_loaded(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = set(tmp_path.iterdir())
     with pytest.warns(UserWarning, match=f"others may write to {cache}") as caught:
-        target, _ = load("// one", Kind.GPU_REFERENCE)
+        target, _ = load("// one", Kind.WGMMA_REFERENCE)
     assert len(caught) == 1 and caught[0].filename == build.__file__
     assert registered == [(target, "cpu")]
     assert set(tmp_path.iterdir()) == before and not any(cache.iterdir())

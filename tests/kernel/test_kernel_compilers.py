@@ -33,7 +33,7 @@ def test_a_processor_that_is_not_known_says_so(compiler, making, registered):
 
 def test_a_compiler_that_cannot_be_run_says_so(compiler):
     compiler("").write_text("")
-    for kind in (Kind.CPU, Kind.GPU_REFERENCE):
+    for kind in (Kind.CPU, Kind.WGMMA_REFERENCE):
         with pytest.raises(BuildError, match=r"^cannot run c\+\+: [^\n]*$"):
             load("// one", kind)
 
@@ -51,7 +51,7 @@ def test_a_compiler_that_cannot_be_run_says_so(compiler):
 def test_a_failure_leaves_nothing_behind(cache, compiler, said, words):
     compiler(f'{OUTPUT}; echo half > "$2"; echo {shlex.quote(said)} >&2; exit 1')
     with pytest.raises(BuildError, match=words):
-        load("// one", Kind.GPU_REFERENCE)
+        load("// one", Kind.WGMMA_REFERENCE)
     assert list(cache.iterdir()) == []
 
 
@@ -89,7 +89,7 @@ def hanging(monkeypatch, tmp_path, compiler):
 
 @pytest.mark.parametrize(
     ("kind", "name", "limit"),
-    [(Kind.GPU_REFERENCE, "c++", 120), (Kind.GPU, "nvcc", 300)],
+    [(Kind.WGMMA_REFERENCE, "c++", 120), (Kind.WGMMA, "nvcc", 300)],
 )
 def test_a_compiler_that_hangs_is_ended(cache, hanging, kind, name, limit):
     read = hanging(name, lambda communicate: communicate())
@@ -107,14 +107,14 @@ def test_an_interrupt_ends_the_compiler(cache, hanging):
 
     read = hanging("c++", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        load("// one", Kind.GPU_REFERENCE)
+        load("// one", Kind.WGMMA_REFERENCE)
     assert read() == b"" and not any(cache.iterdir())
 
 
 def test_a_broken_library_says_so(compiler, registered):
     compiler(f'{OUTPUT}; echo no library > "$2"')
     with pytest.raises(BuildError, match=r"^cannot load the compiled kernel: .*\.so"):
-        load("// one", Kind.GPU_REFERENCE)
+        load("// one", Kind.WGMMA_REFERENCE)
     assert not registered
 
 
@@ -135,7 +135,7 @@ Build cuda_13.0.r13.0/compiler.36424714_0"""
 )
 def test_a_kernel_knows_what_built_it(compiler, making, said, words):
     compiler(making.script, version=said)
-    kernel = load("// one", Kind.GPU_REFERENCE)
+    kernel = load("// one", Kind.WGMMA_REFERENCE)
     assert kernel.compiler == (words or said.splitlines()[0])
 
 
@@ -147,14 +147,14 @@ def test_the_first_compiler_that_is_there(compiler, making, names):
     first = compiler(making.script, name=names[0])
     for name in names[1:]:
         shutil.copy(first, first.with_name(name))
-    load("// one", Kind.GPU_REFERENCE)
+    load("// one", Kind.WGMMA_REFERENCE)
     assert making.commands[0][0] == str(first)
 
 
 def test_without_a_compiler_it_says_so(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BuildError, match=r"^no C\+\+ compiler found \(c\+\+, g\+\+"):
-        load("// one", Kind.GPU_REFERENCE)
+        load("// one", Kind.WGMMA_REFERENCE)
 
 
 def test_nvcc_is_looked_for_in_three_places(monkeypatch, tmp_path, compiler, making):
@@ -170,7 +170,7 @@ def test_nvcc_is_looked_for_in_three_places(monkeypatch, tmp_path, compiler, mak
     monkeypatch.delitem(sys.modules, "nvidia", raising=False)
 
     def used(model):
-        load(f"// {model}", Kind.GPU)
+        load(f"// {model}", Kind.WGMMA, "sm_90a")
         return making.commands[-1]
 
     name, *flags = used("one")
@@ -186,7 +186,7 @@ def test_nvcc_is_looked_for_in_three_places(monkeypatch, tmp_path, compiler, mak
     assert used("four")[0] == str(in_wheel)
     in_wheel.unlink()
     with pytest.raises(BuildError, match=r"^no nvcc found; pip install 'jaxpets"):
-        load("// five", Kind.GPU)
+        load("// five", Kind.WGMMA)
     monkeypatch.setattr(sys, "path", [os.devnull])
     with pytest.raises(BuildError, match=r"^no nvcc found; pip install 'jaxpets"):
-        load("// six", Kind.GPU)
+        load("// six", Kind.WGMMA)

@@ -35,7 +35,7 @@ extern "C" void normal_row(const uint32_t* bits, float* out, int64_t size) {
 NONE = np.array([np.nan, np.inf, -np.inf], np.float32)
 
 
-@pytest.fixture(scope="module", params=[Kind.GPU_REFERENCE, Kind.CPU])
+@pytest.fixture(scope="module", params=[Kind.WGMMA_REFERENCE, Kind.CPU])
 def call(request, tmp_path_factory):
     """Calls a function on many numbers, built as for the kernel or its reference."""
     folder = tmp_path_factory.mktemp("functions")

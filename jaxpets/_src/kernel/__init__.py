@@ -1,25 +1,28 @@
 """The rollout of an ensemble as one compiled kernel: a map of this folder.
 
-`jaxpets.fused_rollout` puts the parts together. Two kernels compute the same rollout:
-one for Hopper GPUs in float16 (gpu_*), one for CPUs in float32 (cpu_*). The GPU's has a
-reference in plain C++, for tests on machines without one.
+`jaxpets.fused_rollout` puts the parts together. Three kernels compute the same rollout:
+one for Hopper GPUs (wgmma_*), one for all GPUs from Ampere on (mma_*), both in float16,
+and one for CPUs in float32 (cpu_*). Those for GPUs have a reference in plain C++, for
+tests on machines without one.
 
 The code. What depends on the model is generated into model.h, all else is fixed:
 
     ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function, primitives
-    sizes -> constants                       {gpu,cpu}_layout.header
-    widths -> tensor core instructions       gpu_layout.products
+    sizes -> constants                       {wgmma,mma,cpu}_layout: header
+    widths -> tensor core instructions       wgmma_layout.products
     model.h and sources -> .so -> FFI target    build.load_kernel
     .so -> the next process                     cache.library
 
 The numbers. Parameters are packed once per plan, and handed over at every call:
 
-    parameters -> weights, as the kernel reads them    {gpu,cpu}_layout.pack
+    parameters -> weights, as the kernel reads them    {gpu,cpu}_layout: pack
     weights, shared numbers, keys, obs, actions -> path    the FFI call
 
 Who includes whom:
 
-    gpu_rollout.cu      gpu_layout.h, handler.h, wgmma.h
+    wgmma_rollout.cu    gpu_layout.h, gpu_warp.h, wgmma.h
+    mma_rollout.cu      gpu_layout.h, gpu_warp.h
+    gpu_warp.h          handler.h
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
     handler.h           rollout.h and XLA's c_api.h: the operands as XLA hands them over

@@ -26,11 +26,28 @@ _LIMIT, _GPU_LIMIT = 120.0, 300.0
 
 
 class Kind(enum.Enum):
-    """What is built: the source file of each."""
+    """What is built: its source file, and whose layout it reads."""
 
-    GPU = "gpu_rollout.cu"
-    GPU_REFERENCE = "gpu_reference.cc"  # the GPU's arithmetic, on a CPU
-    CPU = "cpu_rollout.cc"
+    WGMMA = "wgmma_rollout.cu", "wgmma"  # for Hopper
+    MMA = "mma_rollout.cu", "mma"  # for GPUs of compute capability 8.0 and later
+    WGMMA_REFERENCE = "gpu_reference.cc", "wgmma"  # a GPU's arithmetic, on a CPU
+    MMA_REFERENCE = "gpu_reference.cc", "mma"
+    CPU = "cpu_rollout.cc", "cpu"
+
+    @property
+    def source(self) -> str:
+        """The file that is compiled."""
+        return self.value[0]
+
+    @property
+    def layout(self) -> str:
+        """Which of the layouts it reads."""
+        return self.value[1]
+
+    @property
+    def is_for_gpu(self) -> bool:
+        """Whether it runs on a GPU."""
+        return self.source.endswith(".cu")
 
 
 class BuildError(Exception):
@@ -45,7 +62,7 @@ class Kernel(NamedTuple):
 
 
 @functools.cache
-def load_kernel(model: str, kind: Kind) -> Kernel:
+def load_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
     """Compiles the rollout for a model and registers it with XLA.
 
     The library is kept for the next process, see `cache`.
@@ -53,13 +70,14 @@ def load_kernel(model: str, kind: Kind) -> Kernel:
     Args:
       model: the text of `model.h`.
       kind: what to build.
+      arch: of the GPU, as nvcc calls it: sm_90a.
 
     Raises:
       BuildError: if it cannot be built.
     """
     if os.name != "posix":
         raise BuildError("kernels are built on Linux and macOS only")
-    compiler = _compiler(kind)
+    compiler = _compiler(kind, arch)
     version = _version(compiler[0])
     recipe = [jax.__version__, *compiler, version]
     if kind is Kind.CPU:
@@ -74,7 +92,7 @@ def load_kernel(model: str, kind: Kind) -> Kernel:
             handler = _loaded(library)
     except OSError as error:
         raise BuildError(f"there is no folder to build it in: {error}") from error
-    where = "CUDA" if kind is Kind.GPU else "cpu"
+    where = "CUDA" if kind.is_for_gpu else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
     return Kernel(target, version)
 
@@ -98,8 +116,8 @@ def _compile(
         (folder / file).write_text(text)
     library = folder / "library.so"
     include = [f"-I{folder}", f"-I{jax.ffi.include_dir()}"]
-    command = [*compiler, *include, "-o", str(library), str(folder / kind.value)]
-    _run(command, _GPU_LIMIT if kind is Kind.GPU else _LIMIT)
+    command = [*compiler, *include, "-o", str(library), str(folder / kind.source)]
+    _run(command, _GPU_LIMIT if kind.is_for_gpu else _LIMIT)
     return library
 
 
@@ -146,11 +164,11 @@ def _run(command: list[str], limit: float) -> str:
     return output
 
 
-def _compiler(kind: Kind) -> list[str]:
+def _compiler(kind: Kind, arch: str = "") -> list[str]:
     """Returns the command that builds a library, without the files."""
-    if kind is Kind.GPU:
-        return _nvcc()
-    if kind is Kind.GPU_REFERENCE:
+    if kind.is_for_gpu:
+        return _nvcc(arch)
+    if kind is not Kind.CPU:
         return _host_compiler()
     is_x86 = platform.machine().lower() in ("x86_64", "amd64")
     flags = ["-O3", "-march=native" if is_x86 else "-mcpu=native"]
@@ -185,10 +203,9 @@ def _processor(compiler: list[str]) -> str:
     return defined
 
 
-def _nvcc() -> list[str]:
+def _nvcc(arch: str) -> list[str]:
     flags = ["-std=c++17", "-O3", "-shared", "-Xcompiler=-fPIC"]
-    # wgmma needs the variant "a" of the architecture.
-    flags += ["-gencode=arch=compute_90a,code=sm_90a"]
+    flags += [f"-gencode=arch={arch.replace('sm', 'compute')},code={arch}"]
     if path := shutil.which("nvcc"):
         return [path, *flags]
     if home := os.environ.get("CUDA_HOME"):

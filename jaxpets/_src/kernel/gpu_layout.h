@@ -13,8 +13,7 @@ constexpr int DEPTH = 16;
 constexpr int INPUT_CHUNKS = round_up(INPUTS + 2, DEPTH) / DEPTH;
 constexpr int HIDDEN_CHUNKS = round_up(WIDTH + 2, DEPTH) / DEPTH;
 constexpr int HEAD = round_up(OBS, 8);  // columns for means, then as many for variances
-// A hidden layer is computed in two halves; all chunks of the first come first.
-constexpr int LEFT = round_up(round_up(WIDTH, 16) / 2, 16);
+// Of a hidden layer all chunks of its LEFT columns come first, then those of the others.
 constexpr int RIGHT = WIDTH - LEFT;
 constexpr int INPUT_WEIGHTS = INPUT_CHUNKS * DEPTH * WIDTH;
 constexpr int HIDDEN_WEIGHTS = HIDDEN_CHUNKS * DEPTH * WIDTH;

@@ -12,11 +12,9 @@
 // Operands are float16: as fast as bfloat16, with three more bits. Sums, the head, the
 // state and its update are float32.
 
-#include <cuda_fp16.h>
-
 #include "gpu_layout.h"
 // The layout comes first.
-#include "handler.h"
+#include "gpu_warp.h"
 #include "wgmma.h"
 
 namespace {
@@ -30,9 +28,6 @@ constexpr int NOISE_WARPS = 3;
 // the other consumer has read it, and they cannot take turns.
 constexpr bool FITS = LEFT_STREAMED + RIGHT_STREAMED <= SLOTS * UNIT;
 
-// An odd number of 16 byte words: a thread a row, four numbers at once, and no conflicts.
-constexpr int STATE_STRIDE = 4 * (round_up(OBS, 4) / 4 | 1);
-constexpr int INPUT_STRIDE = INPUT_CHUNKS * DEPTH + 8;
 constexpr int SLOT = UNIT * DEPTH * LEFT;  // LEFT >= RIGHT
 
 // Numbers of a layer that stay in shared memory.
@@ -138,11 +133,6 @@ __device__ __forceinline__ void sync_warpgroup(int warpgroup) {
   asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory");
 }
 
-__device__ __forceinline__ uint32_t pack(float low, float high) {
-  const __half2 pair = __floats2half2_rn(low, high);
-  return *reinterpret_cast<const uint32_t*>(&pair);
-}
-
 // A position in the ring: which slot, and how often the ring has been around.
 struct Cursor {
   int slot = 0;
@@ -202,32 +192,16 @@ __device__ void feed_weights(Shared& smem, const uint16_t* weights, int horizon)
 }
 
 // Draws the noise of `jax.random.normal(key of the step, [E, N, P, OBS])`.
-__device__ void draw_noise(Shared& smem, const Rollout& rollout, const Block& block,
+__device__ void feed_noise(Shared& smem, const Rollout& rollout, const Block& block,
                            int thread) {
-  constexpr int STRIDE = NOISE_WARPS * 32, PER_TILE = TILE * OBS, AT_ONCE = 6;
-  constexpr bool EXACT = PER_TILE % (STRIDE * AT_ONCE) == 0;
   for (int step = 0; step < rollout.horizon; ++step) {
     const uint32_t* key = rollout.keys + KEY * step;
-    const uint32_t key0 = key[0], key1 = key[1];
-    uint32_t counter = noise_counter(rollout, key, block.member, block.first_row) + thread;
+    uint32_t counter = noise_counter(rollout, key, block.member, block.first_row);
     for (int consumer = 0; consumer < block.tiles; ++consumer) {
       wait(&smem.noise_empty[consumer], (step & 1) ^ 1);
-      for (int i = thread; i < PER_TILE; i += STRIDE * AT_ONCE) {
-        uint32_t bits[AT_ONCE];
-        float drawn[AT_ONCE];
-        threefry(key0, key1, counter + (i - thread), STRIDE, bits);
-        normal(bits, drawn);
-        const int column = i % OBS;
-        float* const place = smem.target[consumer] + i / OBS * STATE_STRIDE + column;
-#pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) {
-          const int rows = k * STRIDE / OBS, columns = k * STRIDE % OBS;
-          const int carry = column + columns >= OBS ? STATE_STRIDE - OBS : 0;
-          if (EXACT || i + k * STRIDE < PER_TILE)
-            place[rows * STATE_STRIDE + columns + carry] = drawn[k];
-        }
-      }
-      counter += PER_TILE;
+      draw_noise<TILE * OBS, NOISE_WARPS * 32, 6>(smem.target[consumer], key, counter,
+                                                  thread);
+      counter += TILE * OBS;
       __syncwarp();
       if (thread % 32 == 0) arrive(&smem.noise_full[consumer]);
     }
@@ -301,17 +275,6 @@ __device__ __forceinline__ void finish(float (&sums)[REGISTERS]) {
   for (int i = 0; i < REGISTERS; ++i) asm volatile("" : "+f"(sums[i])::"memory");
 }
 
-// swish(2 h) = h + h tanh(h). The weights are halved when they are packed.
-template <int REGISTERS>
-__device__ __forceinline__ void swish(float (&sums)[REGISTERS]) {
-#pragma unroll
-  for (int i = 0; i < REGISTERS; ++i) {
-    float tanh;
-    asm("tanh.approx.f32 %0, %1;" : "=f"(tanh) : "f"(sums[i]));
-    sums[i] = fmaf(sums[i], tanh, sums[i]);
-  }
-}
-
 // Nothing that stands before is moved behind. The compiler knows of no time that products
 // take: left alone it first waits for them, and then does what could have been done.
 __device__ __forceinline__ void keep_order() { asm volatile("pmevent 0;" ::: "memory"); }
@@ -360,168 +323,34 @@ __device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_
 #pragma unroll
   for (int i = 0; i < RIGHT / 4; ++i)
     activations[LEFT / 4 + i] = pack(right[2 * i], right[2 * i + 1]);
-  // Behind the last activation stand two ones, for the rows that hold the biases.
-#pragma unroll
-  for (int i = WIDTH / 4; i < 4 * HIDDEN_CHUNKS; ++i)
-    activations[i] = i < WIDTH / 4 + 2 && pair == 0 ? pack(1.0f, 1.0f) : 0;
-}
-
-// Writes the features of one particle into the input tile.
-__device__ __forceinline__ void write_features(__half* inputs, const float (&obs)[OBS],
-                                               const float* shared) {
-  float values[FEATURES];
-  features(obs, values);
-#pragma unroll
-  for (int i = 0; i < FEATURES; ++i) values[i] = scaled(values[i], i, shared);
-  uint32_t words[FEATURES / 2 + 1];
-#pragma unroll
-  for (int i = 0; i < FEATURES / 2; ++i)
-    words[i] = pack(values[2 * i], values[2 * i + 1]);
-#pragma unroll
-  for (int i = 0; i < FEATURES / 8; ++i)
-    reinterpret_cast<uint4*>(inputs)[i] = make_uint4(words[4 * i], words[4 * i + 1],
-                                                     words[4 * i + 2], words[4 * i + 3]);
-#pragma unroll
-  for (int i = FEATURES / 8 * 4; i < FEATURES / 2; ++i)
-    reinterpret_cast<uint32_t*>(inputs)[i] = words[i];
-  if (FEATURES % 2) inputs[FEATURES - 1] = __float2half_rn(values[FEATURES - 1]);
-}
-
-// Copies VECTOR numbers out of shared memory; no branch, for use between products.
-constexpr int VECTOR = OBS % 4 == 0 ? 4 : OBS % 2 == 0 ? 2 : 1;
-__device__ __forceinline__ void store(float* to, const float* from, bool wanted) {
-  if constexpr (VECTOR == 4) {
-    const float4 v = *reinterpret_cast<const float4*>(from);
-    asm volatile(
-        "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %5, 0;\n"
-        "@wanted st.global.v4.f32 [%0], {%1, %2, %3, %4};\n}" ::"l"(to),
-        "f"(v.x), "f"(v.y), "f"(v.z), "f"(v.w), "r"(int(wanted))
-        : "memory");
-  } else if constexpr (VECTOR == 2) {
-    const float2 v = *reinterpret_cast<const float2*>(from);
-    asm volatile(
-        "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %3, 0;\n"
-        "@wanted st.global.v2.f32 [%0], {%1, %2};\n}" ::"l"(to),
-        "f"(v.x), "f"(v.y), "r"(int(wanted))
-        : "memory");
-  } else {
-    asm volatile(
-        "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %2, 0;\n"
-        "@wanted st.global.f32 [%0], %1;\n}" ::"l"(to),
-        "f"(*from), "r"(int(wanted))
-        : "memory");
-  }
-}
-
-// Turns means and raw log-variances into draws; the noise stands where they go. Mean and
-// log-variance of one entry lie in the same thread, entries two by two.
-__device__ __forceinline__ void draw_targets(float* target, const float (&head)[HEAD],
-                                             const float* shared, int pair) {
-#pragma unroll
-  for (int i = 0; i < HEAD / 2; i += 2) {
-    // Wait for no branch: what stands behind the last entry is computed, not stored.
-    const int column = i / 4 * 8 + 2 * pair;
-    const int at = i / 4 * 8 + 6 < OBS ? column : min(column, (OBS - 1) / 2 * 2);
-    float2* const place =
-        reinterpret_cast<float2*>(target + i % 4 / 2 * 8 * STATE_STRIDE + at);
-    const float2 low = *reinterpret_cast<const float2*>(shared + MIN_VARIANCE + at);
-    const float2 high = *reinterpret_cast<const float2*>(shared + MAX_PRECISION + at);
-    float2 value = *place;
-    value.x = head[i] + value.x * deviation(head[HEAD / 2 + i], low.x, high.x);
-    value.y = head[i + 1] + value.y * deviation(head[HEAD / 2 + i + 1], low.y, high.y);
-    if (column == at) *place = value;
-  }
+  append_ones(activations, pair);
 }
 
 template <int TILES>
 __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block,
                         int consumer, int thread) {
-  // A warp has 16 particles from beginning to end.
-  constexpr int WARP_ROWS = TILE / 4;
-  constexpr int ACTIONS = (WARP_ROWS * ACTION + 31) / 32;  // of a lane
-  constexpr int VECTORS = (WARP_ROWS * OBS / VECTOR + 31) / 32;
-  const int warp = thread / 32, lane = thread % 32, group = lane / 4, pair = lane % 4;
-  const int own = warp * WARP_ROWS, row = own + lane % WARP_ROWS;
-  const bool owns_state = lane < WARP_ROWS;
-  const int step_stride = rollout.num_members * rollout.particles * OBS;
-  __half* const inputs = smem.inputs[consumer] + own * INPUT_STRIDE;
-  float* const states = smem.state[consumer] + own * STATE_STRIDE;
-  float* const targets = smem.target[consumer] + own * STATE_STRIDE;
-  const int* const path_offsets = smem.path_offset[consumer] + own;
-  const int* const action_offsets = smem.action_offset[consumer] + own;
-  float action[ACTIONS];
-
-  const auto load_actions = [&](int step) {
-#pragma unroll
-    for (int k = 0; k < ACTIONS; ++k) {
-      const int i = min(lane + 32 * k, WARP_ROWS * ACTION - 1);
-      action[k] =
-          rollout.actions[action_offsets[i / ACTION] + step * ACTION + i % ACTION];
-    }
-  };
-  const auto write_actions = [&] {
-#pragma unroll
-    for (int k = 0; k < ACTIONS; ++k) {
-      const int i = min(lane + 32 * k, WARP_ROWS * ACTION - 1);
-      const int column = FEATURES + i % ACTION;
-      inputs[i / ACTION * INPUT_STRIDE + column] =
-          __float2half_rn(scaled(action[k], column, smem.shared));
-    }
-  };
-  const auto store_states = [&](int step) {
-#pragma unroll
-    for (int k = 0; k < VECTORS; ++k) {
-      const int i = min(lane + 32 * k, WARP_ROWS * OBS / VECTOR - 1) * VECTOR;
-      const int in_row = i % OBS, offset = path_offsets[i / OBS];
-      store(rollout.path + offset + step * step_stride + in_row,
-            states + i / OBS * STATE_STRIDE + in_row, offset >= 0);
-    }
-  };
-
-  for (int i = lane; i < WARP_ROWS * INPUT_STRIDE; i += 32) {
-    const int column = i % INPUT_STRIDE;
-    inputs[i] = column == INPUTS || column == INPUTS + 1 ? __half(1.0f) : __half(0.0f);
-  }
-  if (owns_state) {
-    const int rows = rollout.num_candidates * rollout.particles;
-    const int wanted = block.first_row + consumer * TILE + row;
-    const int particle = min(wanted, rows - 1);
-    const int candidate = particle / rollout.particles;
-    const int in_step =
-        (block.member * rollout.particles + particle % rollout.particles) * OBS;
-    smem.path_offset[consumer][row] =
-        wanted < rows ? candidate * (rollout.horizon + 1) * step_stride + in_step : -1;
-    smem.action_offset[consumer][row] = candidate * rollout.horizon * ACTION;
-  }
-  __syncwarp();
-  if (owns_state) {
-    float obs[OBS];
-#pragma unroll
-    for (int i = 0; i < OBS; ++i)
-      states[lane * STATE_STRIDE + i] = obs[i] = rollout.obs[i];
-    write_features(inputs + lane * INPUT_STRIDE, obs, smem.shared);
-  }
-  load_actions(0);
-  write_actions();
+  const int lane = thread % 32, pair = lane % 4, own = thread / 32 * ROWS;
+  Warp warp = {rollout,
+               smem.shared,
+               smem.inputs[consumer] + own * INPUT_STRIDE,
+               smem.state[consumer] + own * STATE_STRIDE,
+               smem.target[consumer] + own * STATE_STRIDE,
+               smem.path_offset[consumer] + own,
+               smem.action_offset[consumer] + own,
+               lane,
+               rollout.num_members * rollout.particles * OBS};
+  warp.begin(block.member, block.first_row + consumer * TILE + own);
   sync_warpgroup(consumer);
   wait(&smem.resident_full, 0);
   if (consumer == 1) pass_turn<TILES>(consumer);  // the other one is first
 
   Cursor cursor;
   for (int step = 0; step < rollout.horizon; ++step) {
-    load_actions(min(step + 1, rollout.horizon - 1));
+    warp.load_actions(min(step + 1, rollout.horizon - 1));
     float head[HEAD];
     {
       uint32_t activations[4 * HIDDEN_CHUNKS], operand[4 * INPUT_CHUNKS];
-      const __half* from = inputs + group * INPUT_STRIDE + 2 * pair;
-#pragma unroll
-      for (int chunk = 0; chunk < INPUT_CHUNKS; ++chunk) {
-#pragma unroll
-        for (int i = 0; i < 4; ++i)  // rows +0 and +8, then both 8 columns on
-          operand[4 * chunk + i] = *reinterpret_cast<const uint32_t*>(
-              from + i % 2 * 8 * INPUT_STRIDE + i / 2 * 8 + chunk * DEPTH);
-      }
-      __syncwarp();
+      warp.read_inputs(operand);
       hidden_layer<TILES, INPUT_CHUNKS, 0, 0>(activations, operand, smem.resident, smem,
                                               cursor, pair, consumer);
       const __half* resident = smem.resident + RESIDENT_INPUT;
@@ -533,30 +362,17 @@ __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block
       }
       multiply<HIDDEN_CHUNKS, 2 * HEAD, 0, false>(head, activations, resident, smem,
                                                   cursor);
-      write_actions();
-      store_states(step);
+      warp.write_actions();
+      warp.store_states(step);
       keep_order();
       finish<0>(head);
     }
     wait(&smem.noise_full[consumer], step & 1);
-    draw_targets(targets + group * STATE_STRIDE, head, smem.shared, pair);
-    __syncwarp();
-    if (owns_state) {
-      float obs[OBS], drawn[OBS];
-#pragma unroll
-      for (int i = 0; i < OBS; ++i) {
-        obs[i] = states[lane * STATE_STRIDE + i];
-        drawn[i] = targets[lane * STATE_STRIDE + i];
-      }
-      move(obs, drawn, smem.shared);
-#pragma unroll
-      for (int i = 0; i < OBS; ++i) states[lane * STATE_STRIDE + i] = obs[i];
-      write_features(inputs + lane * INPUT_STRIDE, obs, smem.shared);
-    }
+    warp.move_all(head);
     sync_warpgroup(consumer);
     if (thread == 0) arrive(&smem.noise_empty[consumer]);
   }
-  store_states(rollout.horizon);
+  warp.store_states(rollout.horizon);
 }
 
 __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
@@ -587,7 +403,7 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
   if (warpgroup == CONSUMERS) {
     asm volatile("setmaxnreg.dec.sync.aligned.u32 56;");
     if (thread >= 32)
-      draw_noise(smem, rollout, block, thread - 32);
+      feed_noise(smem, rollout, block, thread - 32);
     else if (thread == 0)
       feed_weights(smem, weights, rollout.horizon);
   } else {
