@@ -109,7 +109,13 @@ def test_work_of_the_paper_is_what_is_published():
 def test_plan_over_seeds_and_samples(tmp_path):
     path = tmp_path / "rows.jsonl"
     results = {"ms_per_plan", "gflop", "tflops_per_s"}
-    labels = {"name": "jaxpets", "dtype": "bf16", "engine": "scan", "seeds": 2}
+    labels = {
+        "name": "jaxpets",
+        "dtype": "bf16",
+        "engine": "scan",
+        "arch": "",
+        "seeds": 2,
+    }
     common = ["--tiny", "--repeats", "2", "--json", str(path)]
     found = plan.main(["--seeds", "2", *common])
     check_rows(found, path, results, labels)
@@ -157,7 +163,7 @@ def test_rollout_and_fit(tmp_path):
     path = tmp_path / "rows.jsonl"
     common = ["--tiny", "--repeats", "2", "--json", str(path)]
     found = rollout.main(["--precision", "f32", *common])
-    check_rows(found, path, {"us_per_step", "tflops_per_s"})
+    check_rows(found, path, {"us_per_step", "tflops_per_s"}, {"arch": ""})
     found = fit.main(["--seeds", "2", "--epochs", "2", *common])
     check_rows(found, path, {"us_per_update"})
     assert found[0]["sizes"]["updates"] == 2 * 4  # 100 rows, the last batch partial

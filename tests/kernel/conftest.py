@@ -4,17 +4,13 @@ import os
 import shlex
 import shutil
 import subprocess
-from pathlib import Path
 
 import jax
 import pytest
-from rollouts import ENGINES
-
-import jaxpets
+from rollouts import ENGINES, SOURCES
 
 # In a script: $2 is then where the library goes.
 OUTPUT = 'while [ "$1" != -o ]; do shift; done'
-SOURCES = Path(jaxpets.__file__).parent / "_src" / "kernel"
 
 
 @pytest.fixture(params=ENGINES)

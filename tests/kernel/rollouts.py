@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jaxpets._src.kernel.build import Kind
 from jaxpets.envs import half_cheetah as hc
 from jaxpets.envs.observations import readings
 
+SOURCES = Path(build.__file__).parent
 _real = build._compiler
 
 

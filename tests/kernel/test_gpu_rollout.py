@@ -8,8 +8,15 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from conftest import SOURCES
-from rollouts import CASES, CHEETAH, SMALL, recorded, relative_error, stacked
+from rollouts import (
+    CASES,
+    CHEETAH,
+    SMALL,
+    SOURCES,
+    recorded,
+    relative_error,
+    stacked,
+)
 
 import jaxpets
 from jaxpets import Precision

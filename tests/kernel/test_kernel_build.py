@@ -11,6 +11,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from rollouts import SOURCES
 
 from jaxpets._src.kernel import build
 from jaxpets._src.kernel.build import BuildError, Kind
@@ -19,7 +20,6 @@ from jaxpets._src.kernel.build import BuildError, Kind
 load = build.load_kernel.__wrapped__
 
 pytestmark = pytest.mark.usefixtures("cache", "registered")
-SOURCES = Path(build.__file__).parent
 
 
 def kept(cache):
