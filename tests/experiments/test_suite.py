@@ -1,6 +1,7 @@
 """Twenty tasks of the suite beside others' numbers."""
 
 import json
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -90,3 +91,11 @@ def test_the_committed_numbers_of_others_are_of_every_task():
         returns = peers.returns[system.name]
         assert set(returns) == set(suite.NAMES)
         assert all(len(x) == len(system.steps) for x in returns.values())
+
+
+def test_committed_results_are_those_of_the_committed_logs(tmp_path):
+    results = Path(__file__).parents[2] / "results"
+    with tarfile.open(results / "dmc20" / "best.tar.xz") as logs:
+        logs.extractall(tmp_path, filter="data")
+    found = suite.results(tmp_path, 100, "")
+    assert found == json.loads((results / "dmc20.json").read_text())
