@@ -34,11 +34,13 @@ TASKS = {
     "reacher": ("easy", "hard"),
     "walker": ("stand", "walk", "run"),
 }
-NAMES = tuple(
-    f"{domain.partition('-')[0]}/{task}"
-    for domain, tasks in TASKS.items()
-    for task in tasks
-)
+
+
+def _name(domain: str, task: str) -> str:
+    return f"{domain.partition('-')[0]}/{task}"
+
+
+NAMES = tuple(_name(domain, task) for domain in TASKS for task in TASKS[domain])
 PEERS = Path("results/dmc20-peers.json")
 Results = dict[str, dict[str, dict[str, Any]]]  # arm -> domain/task -> numbers
 
@@ -96,15 +98,17 @@ def results(runs: Path, explored: int, tag: str) -> Results:
       RunError: if a log cannot be read, or there is none.
     """
     rows = [row for row in logs.load(runs) if row.tag == tag]
+    configs = {run: logs.config(run) for run in {row.run for row in rows}}
     found: Results = {}
     for domain, tasks in TASKS.items():
-        own = [row for row in rows if _robot(row) == f"dmc/{domain}"]
+        env = f"dmc/{domain}"
+        own = [row for row in rows if configs[row.run].get("env") == env]
         for arm, scores in logs.scores(own, explored).items():
-            steps = explored * _trial_steps(own)
+            steps = explored * _trial_steps(configs[own[0].run])
             for task in tasks:
                 if task in scores:
-                    name = f"{domain.partition('-')[0]}/{task}"
-                    found.setdefault(arm, {})[name] = _numbers(scores[task], steps)
+                    numbers = _numbers(scores[task], steps)
+                    found.setdefault(arm, {})[_name(domain, task)] = numbers
     return found
 
 
@@ -143,13 +147,8 @@ def read_peers(path: Path) -> Peers:
         raise UsageError(f"{path} has no numbers of others: {error}") from error
 
 
-def _robot(row: logs.Row) -> str:
-    return str(logs.config(row.run).get("env"))
-
-
-def _trial_steps(rows: Sequence[logs.Row]) -> int:
+def _trial_steps(config: Mapping[str, Any]) -> int:
     """Returns the suite's control steps in a trial of exploration."""
-    config = logs.config(rows[0].run)
     repeat = robots.of(Config(env=config["env"])).action_repeat
     return int(config["trial_length"]) * repeat
 

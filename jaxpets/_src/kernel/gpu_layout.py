@@ -42,7 +42,7 @@ class GpuLayout(abc.ABC):
 
     @property
     def width(self) -> int:
-        """Columns of a hidden layer; both halves need some."""
+        """Columns of a hidden layer; if it is cut in halves, both need some."""
         return max(24, round_up(max(self.hidden_sizes), 8))
 
     @property

@@ -13,6 +13,10 @@ constexpr int ROWS = 16;
 constexpr int STATE_STRIDE = 4 * (round_up(OBS, 4) / 4 | 1);
 constexpr int INPUT_STRIDE = INPUT_CHUNKS * DEPTH + 8;
 
+__device__ __forceinline__ uint32_t address(const void* pointer) {
+  return static_cast<uint32_t>(__cvta_generic_to_shared(pointer));
+}
+
 __device__ __forceinline__ uint32_t pack(float low, float high) {
   const __half2 pair = __floats2half2_rn(low, high);
   return *reinterpret_cast<const uint32_t*>(&pair);

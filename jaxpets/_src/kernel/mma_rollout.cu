@@ -11,6 +11,7 @@
 
 #include "gpu_layout.h"
 // The layout comes first.
+#include "gpu_launch.h"
 #include "gpu_warp.h"
 
 namespace {
@@ -30,10 +31,6 @@ struct alignas(16) Shared {
   alignas(16) __half inputs[TILE * INPUT_STRIDE];
   int path_offset[TILE], action_offset[TILE];  // of each row
 };
-
-__device__ __forceinline__ uint32_t address(const void* pointer) {
-  return static_cast<uint32_t>(__cvta_generic_to_shared(pointer));
-}
 
 // The ring. Chunks are used in the order in which they lie in memory, in every step.
 struct Ring {
@@ -186,26 +183,17 @@ __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
 XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {
   constexpr size_t size = sizeof(Shared);
   static_assert(size <= SHARED_MEMORY, "a block's shared memory is too small");
-  XLA_FFI_Stream_Get_Args args = {};
-  args.struct_size = XLA_FFI_Stream_Get_Args_STRUCT_SIZE;
-  args.ctx = call.ctx;
-  if (XLA_FFI_Error* none = call.api->XLA_FFI_Stream_Get(&args)) return none;
-  const auto stream = static_cast<cudaStream_t>(args.stream);
-  cudaError_t error = cudaFuncSetAttribute(
-      rollout_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, size);
-  if (error == cudaSuccess) {
+  const auto kernel = reinterpret_cast<const void*>(rollout_kernel);
+  return launch_on_stream(call, kernel, size, [&](cudaStream_t stream) {
     const int64_t blocks =
         blocks_of_member(rollout) * rollout.num_members * rollout.batch;
     rollout_kernel<<<blocks, THREADS, size, stream>>>(rollout);
-    error = cudaGetLastError();
-  }
-  if (error == cudaSuccess) return nullptr;
-  return failure(call, XLA_FFI_Error_Code_INTERNAL, cudaGetErrorString(error));
+    return cudaSuccess;
+  });
 }
 
 }  // namespace
 
-// The stream is only launched on, so XLA may record the call in a CUDA graph.
 extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
   return handle(*call, XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE, run);
 }

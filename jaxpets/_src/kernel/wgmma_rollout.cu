@@ -14,6 +14,7 @@
 
 #include "gpu_layout.h"
 // The layout comes first.
+#include "gpu_launch.h"
 #include "gpu_warp.h"
 #include "wgmma.h"
 
@@ -84,10 +85,6 @@ __device__ __forceinline__ Block find_block(const Rollout& rollout, const Split&
   const int rows = rollout.num_candidates * rollout.particles - first_row;
   const int tiles = rows <= 0 ? 0 : rows <= TILE || is_half ? 1 : 2;
   return {index / of_batch, index % of_batch / blocks, first_row, tiles};
-}
-
-__device__ __forceinline__ uint32_t address(const void* pointer) {
-  return static_cast<uint32_t>(__cvta_generic_to_shared(pointer));
 }
 
 __device__ __forceinline__ void init_barrier(uint64_t* barrier, int arrivals) {
@@ -418,32 +415,23 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
 XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {
   constexpr size_t size = sizeof(Shared);
   static_assert(size <= 232448, "a block's shared memory is too small for this model");
-  XLA_FFI_Stream_Get_Args args = {};
-  args.struct_size = XLA_FFI_Stream_Get_Args_STRUCT_SIZE;
-  args.ctx = call.ctx;
-  if (XLA_FFI_Error* none = call.api->XLA_FFI_Stream_Get(&args)) return none;
-  const auto stream = static_cast<cudaStream_t>(args.stream);
-  int device = 0, multiprocessors = 1;
-  cudaError_t error = cudaGetDevice(&device);
-  if (error == cudaSuccess)
-    error = cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount,
-                                   device);
-  if (error == cudaSuccess)
-    error = cudaFuncSetAttribute(rollout_kernel,
-                                 cudaFuncAttributeMaxDynamicSharedMemorySize, size);
-  if (error == cudaSuccess) {
+  const auto kernel = reinterpret_cast<const void*>(rollout_kernel);
+  return launch_on_stream(call, kernel, size, [&](cudaStream_t stream) {
+    int device = 0, multiprocessors = 1;
+    cudaError_t error = cudaGetDevice(&device);
+    if (error == cudaSuccess)
+      error = cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount,
+                                     device);
+    if (error != cudaSuccess) return error;
     const Split split = split_up(rollout, multiprocessors);
     rollout_kernel<<<split.whole + 2 * split.halved, THREADS, size, stream>>>(rollout,
                                                                               split);
-    error = cudaGetLastError();
-  }
-  if (error == cudaSuccess) return nullptr;
-  return failure(call, XLA_FFI_Error_Code_INTERNAL, cudaGetErrorString(error));
+    return cudaSuccess;
+  });
 }
 
 }  // namespace
 
-// The stream is only launched on, so XLA may record the call in a CUDA graph.
 extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
   return handle(*call, XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE, run);
 }
