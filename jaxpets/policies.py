@@ -10,6 +10,13 @@ from jaxpets._src.actor_critic_records import (
     Goals,
     Guided,
 )
+from jaxpets._src.distill_records import (
+    DistillConfig,
+    Distiller,
+    DistillMetrics,
+    DistillState,
+)
+from jaxpets._src.policy_onnx import to_onnx
 
 __all__ = [
     "ActorCritic",
@@ -17,7 +24,12 @@ __all__ = [
     "ActorCriticMetrics",
     "ActorCriticParams",
     "ActorCriticState",
+    "DistillConfig",
+    "DistillMetrics",
+    "DistillState",
+    "Distiller",
     "Goals",
     "Guided",
     "actor_critic",
+    "to_onnx",
 ]
