@@ -31,7 +31,7 @@ KERNEL, SCAN, NOTHING = "kernel", "scan", "none"
 Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
 # Every phase draws from its own stream of keys.
-EXPLORE, ZERO_SHOT, FINETUNE, REFIT, CRITIC = 0, 1, 2, 3, 4
+EXPLORE, ZERO_SHOT, FINETUNE, REFIT, CRITIC, DISTILL = range(6)
 
 
 class Parts(NamedTuple):

@@ -14,16 +14,7 @@ import numpy as np
 from .. import errors
 from ..errors import StorageError
 from ..parallel import distributed
-from . import (
-    checkpoint,
-    disk,
-    identity,
-    metrics,
-    pytrees,
-    rundir,
-    status,
-    trajectories,
-)
+from . import checkpoint, disk, identity, metrics, pytrees, rundir, status, trajectories
 from .environment import environment, remember
 from .identity import Differences
 from .status import Writer
@@ -156,6 +147,10 @@ class RunFolder(NamedTuple):
     def save_trajectories(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes what a video is made of."""
         distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
+
+    def export(self, name: str, data: bytes) -> None:
+        """Replaces a file that only others read."""
+        distributed.on_first(lambda: disk.write(self.path / name, data))
 
     def computes(self, **entries: str) -> list[str]:
         """Keeps what computes the run's numbers beside the rest of its environment.
