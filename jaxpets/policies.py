@@ -16,6 +16,7 @@ from jaxpets._src.distill_records import (
     DistillMetrics,
     DistillState,
 )
+from jaxpets._src.policy_file import load_policy, save_policy
 from jaxpets._src.policy_onnx import to_onnx
 
 __all__ = [
@@ -31,5 +32,7 @@ __all__ = [
     "Goals",
     "Guided",
     "actor_critic",
+    "load_policy",
+    "save_policy",
     "to_onnx",
 ]
