@@ -1,6 +1,8 @@
 """The policy that is distilled from a planner, as a config has it, and its files."""
 
+import functools
 import operator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,6 +17,7 @@ from jaxpets.policies import (
     DistillConfig,
     Distiller,
     Goals,
+    save_policy,
     to_onnx,
 )
 
@@ -82,19 +85,25 @@ def family(robot: Robot, count: int) -> Goals:
 def export(
     run: RunFolder, config: Config, parts: Parts, networks: ActorCriticParams
 ) -> None:
-    """Writes the policies `[S]` for programs without JAX, or says why not."""
-    env = parts.robot.env
+    """Writes the policies `[S]` for others, and for programs without JAX if it can."""
+    env, space = parts.robot.env, parts.robot.space
+    built: Any = {
+        "obs_size": parts.model.obs_size,
+        "action_low": env.action_low,
+        "action_high": env.action_high,
+    }
     for i, seed in enumerate(config.seeds):
+        name = f"policy-{seed}"
         params = jax.tree.map(operator.itemgetter(i), networks)
+        save = functools.partial(save_policy, params=params, space=space, **built)
+        run.export(f"{name}.safetensors", save)
         try:
-            content = to_onnx(
-                params,
-                parts.robot.space,
-                obs_size=parts.model.obs_size,
-                action_low=env.action_low,
-                action_high=env.action_high,
-            )
+            content = to_onnx(params, space, **built)
         except (ImportError, ValueError) as error:
-            run.say(f"no file of the policy: {error}")
-            return
-        run.export(f"policy-{seed}.onnx", content)
+            run.say(f"no {name}.onnx: {error}")
+            continue
+        run.export(f"{name}.onnx", functools.partial(_write, content))
+
+
+def _write(content: bytes, target: Path) -> None:
+    target.write_bytes(content)

@@ -5,7 +5,7 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -148,9 +148,14 @@ class RunFolder(NamedTuple):
         """Writes what a video is made of."""
         distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
 
-    def export(self, name: str, data: bytes) -> None:
-        """Replaces a file that only others read."""
-        distributed.on_first(lambda: disk.write(self.path / name, data))
+    def export(self, name: str, write: Callable[[Path], object]) -> None:
+        """Replaces a file that only others read by what `write` writes."""
+
+        def replace() -> None:
+            with disk.replaced(self.path / name) as target:
+                write(target)
+
+        distributed.on_first(replace)
 
     def computes(self, **entries: str) -> list[str]:
         """Keeps what computes the run's numbers beside the rest of its environment.

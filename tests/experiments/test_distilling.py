@@ -8,6 +8,7 @@ import runs
 from experiments import policy, robots
 from experiments.run import main
 from experiments.storage import rundir
+from jaxpets.policies import load_policy
 
 PHASE = ("--phase", "distill", "--task", "forward,front-flip")
 FOLDER = "distill-003-forward-front-flip"
@@ -42,6 +43,7 @@ def test_a_policy_performs_beside_its_planner(explored, capsys):
     paths = np.load(folder / "trajectories.npz")
     seen, acted = paths["obs"][:, :, 0, :-1], paths["action"][:, :, 0, 1:]
     assert np.ptp(acted[0] - acted[1]) > 1e-3  # seeds have networks of their own
+    assert load_policy(folder / "policy-7.safetensors")
     onnxruntime = pytest.importorskip("onnxruntime")
     goal = [[1.0, 0.0, 0.1], [0.0, 1.0, 0.1]]
     for i, seed in enumerate((0, 7)):
