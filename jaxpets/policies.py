@@ -18,6 +18,7 @@ from jaxpets._src.distill_records import (
 )
 from jaxpets._src.policy_file import load_policy, save_policy
 from jaxpets._src.policy_onnx import to_onnx
+from jaxpets._src.prior import prior
 
 __all__ = [
     "ActorCritic",
@@ -33,6 +34,7 @@ __all__ = [
     "Guided",
     "actor_critic",
     "load_policy",
+    "prior",
     "save_policy",
     "to_onnx",
 ]

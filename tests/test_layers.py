@@ -78,6 +78,7 @@ LAYERS = {
     "_src.model_file": 6,
     "_src.policy_file": 6,
     "_src.policy_onnx": 5,
+    "_src.prior": 2,
     "_src.pretrained": 7,
     "_src.learner": 6,
     "_src.over_seeds": 7,

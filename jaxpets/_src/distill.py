@@ -1,7 +1,6 @@
 """A planner's decisions as a network: a policy for when there is no time to plan."""
 
 import functools
-import operator
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -42,7 +41,7 @@ _NO_GOALS = Goals()
 
 
 def distill(
-    planner: Planner,
+    planner: Planner | Callable[[Planner, RewardFn], Planner],
     dynamics_fn: DynamicsFn,
     reward_fn: RewardFn,
     optimizer: Optimizer,
@@ -74,7 +73,11 @@ def distill(
 
     Args:
       planner: whose decisions are learned; it reads `PlanParams`. Its actions are in
-        the box.
+        the box. Or what builds it, `(policy, reward_fn) -> Planner`, from the policy
+        and a reward whose data are Guided, as those of the planner then are: for
+        `plan(propose_fn=policies.prior(policy, ...))`. A search that begins with what
+        the policy would do finds what is better near it, and of several ways that are
+        as good it takes the one that the policy knows, so that it can be learned.
       dynamics_fn: the model in which trials are imagined; reads `PlanParams.dynamics`,
         and gets actions `[E, B, A]`.
       reward_fn: of the planner; reads `PlanParams.reward` and is asked about single
@@ -98,7 +101,6 @@ def distill(
     Raises:
       TypeError, ValueError: if an argument is not what it should be.
     """
-    check_record("planner", planner, Planner)
     check_callable("dynamics_fn", dynamics_fn)
     check_optimizer(optimizer)
     check_record("config", config, DistillConfig)
@@ -110,29 +112,36 @@ def distill(
         check_callable("terminal_fn", terminal_fn)
     box = action_box(action_low, action_high)
     networks = build_networks(config.hidden_size, space, goals, box)
+    reward, is_guided = guided_reward(reward_fn), not isinstance(planner, Planner)
+    if not isinstance(planner, Planner):
+        check_callable("planner", planner)
+        planner = planner(networks.policy, reward)
+    check_record("planner", planner, Planner)
     learn = build_update(networks, optimizer, config.batch_size)
     rows = (num_members, -(-config.num_trials // num_members))
     num_trials = rows[0] * rows[1]
     # Whole imagined steps.
     capacity = -(-config.capacity // num_trials) * num_trials
     goals_of = over_trials(goals.features, rows)
-    fresh, ask = build_trials(
-        planner, networks, config, box, rows, goals,
+    trials = build_trials(
+        planner, networks, config, box, rows, goals, is_guided,
         imagine(dynamics_fn, reward_fn, terminal_fn, _given, 1),
     )  # fmt: skip
 
     def init(params: PlanParams, key: Array, dataset: Dataset) -> DistillState:
         check_imagined(params, key, dataset, obs_size)
         start_key, draw_key, network_key, plan_key = jax.random.split(key, 4)
-        obs, rewards, planning = fresh(params.reward, start_key, dataset)
+        obs, rewards, planning = trials.fresh(params.reward, start_key, dataset)
         low, high = reward_range(
             reward_fn, goals.draw, params.reward, draw_key, dataset
         )
         goal = goals_of(rewards).reshape(num_trials, -1)
-        horizon = _horizon(planner, params, plan_key, rewards, obs)
-        largest = horizon * jnp.maximum(high, -low)
+        found = networks.init(network_key, goal, dataset)
+        keys = jax.random.split(plan_key, rows)
+        plan = jax.eval_shape(trials.plan, params, found, keys, rewards, planning, obs)
+        largest = plan[0].actions.shape[2] * jnp.maximum(high, -low)
         scale = 1.0 / jnp.where(largest > 0.0, largest, 1.0)
-        found = networks.init(network_key, goal, dataset)._replace(scale=scale)
+        found = found._replace(scale=scale)
         sizes = (found.mean.shape, box.center.shape, (), ())
         plans = Plans(*(jnp.zeros((capacity, *x), jnp.float32) for x in sizes))
         opt_state = optimizer.init(cast(Any, (found.actor, found.critics)))
@@ -147,7 +156,7 @@ def distill(
         noise_key, ask_key, learn_key = jax.random.split(key, 3)
         noise = config.noise * jax.random.uniform(noise_key, (*rows, 1), jnp.float32)
         ask_keys = jax.random.split(ask_key, config.horizon)
-        asked = functools.partial(ask, params, dataset, noise)
+        asked = functools.partial(trials.ask, params, dataset, noise)
         state, found = jax.lax.scan(asked, state, ask_keys)
         square, value, number = (jnp.sum(x) for x in found)
         number = jnp.maximum(number, 1.0)
@@ -160,21 +169,10 @@ def distill(
         )
         return state, metrics
 
-    reward = guided_reward(reward_fn)
-    return Distiller(init, step, networks.policy, reward, networks.value_fn)
+    return Distiller(init, step, networks.policy, planner, reward, networks.value_fn)
 
 
 def _given(action: Array, key: Array, rewards: Any, obs: Array) -> Array:
     """The policy of imagined trials whose actions are known already."""
     del key, rewards, obs
     return action
-
-
-def _horizon(
-    planner: Planner, params: PlanParams, key: Array, rewards: Any, obs: Array
-) -> int:
-    """Returns how many steps a plan has."""
-    first = jax.tree.map(operator.itemgetter((0, 0)), (rewards, obs))
-    known = PlanParams(params.dynamics, first[0])
-    plan = jax.eval_shape(planner.step, known, key, planner.init(), first[1])[0]
-    return plan.actions.shape[0]

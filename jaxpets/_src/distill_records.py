@@ -111,6 +111,8 @@ class Distiller(NamedTuple):
       step: `(PlanParams, key, state, dataset) -> (state, DistillMetrics)`.
       policy: a Planner that acts by the policy alone; its `PlanParams.reward` is
         Guided, its value the one learned, and the model is not read.
+      planner: that is asked; if it was built from the policy, its `PlanParams.reward`
+        is Guided.
       reward_fn: the reward, for `plan` with Guided data.
       value_fn: what the planner would expect, for `plan` with Guided data.
     """
@@ -121,5 +123,6 @@ class Distiller(NamedTuple):
         tuple[DistillState, DistillMetrics],
     ]
     policy: Planner
+    planner: Planner
     reward_fn: RewardFn
     value_fn: Callable[[Guided, Array], Array]

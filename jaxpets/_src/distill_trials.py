@@ -9,16 +9,15 @@ from jax import Array
 
 from jaxpets._src.action_box import ActionBox
 from jaxpets._src.actor_critic_networks import Networks
-from jaxpets._src.actor_critic_records import Goals
+from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
 from jaxpets._src.distill_records import DistillConfig, DistillState, Plans
 from jaxpets._src.distill_update import keep
 from jaxpets._src.elites import WORST_VALUE
 from jaxpets._src.imagined_trials import Imagined, renewed, trial_starts
-from jaxpets._src.types import Dataset, Planner, PlanParams
+from jaxpets._src.types import Dataset, Planner, PlanOutput, PlanParams
 
-# Axes of the arguments of a planner's step; trials share the model.
-_OWN: Any = 0
-_TRIALS = (PlanParams(None, _OWN), 0, 0, 0)
+_OWN: Any = 0  # the axis of what every trial has
+_SHARED: Any = None
 
 
 class Asked(NamedTuple):
@@ -40,11 +39,13 @@ class Trials(NamedTuple):
 
     Attributes:
       fresh: `(reward data, key, dataset) -> (obs, rewards, planning)` where they begin.
+      plan: `(PlanParams, networks, keys, rewards, planning, obs)`, as a planner's step.
       ask: `(PlanParams, dataset, noise [E, B, 1], state, key) -> (state, Asked)`: plans
         in all of them, and moves them by one step.
     """
 
     fresh: Callable[[Any, Array, Dataset], tuple[Array, Any, Any]]
+    plan: Callable[..., tuple[PlanOutput, Any]]
     ask: Callable[
         [PlanParams, Dataset, Array, DistillState, Array], tuple[DistillState, Asked]
     ]
@@ -65,12 +66,25 @@ def build_trials(
     box: ActionBox,
     rows: tuple[int, int],
     goals: Goals,
+    is_guided: bool,
     move: Callable[[Any, Any, Array, Any, Array], Imagined],
 ) -> Trials:
-    """Builds the functions; see `distill`. `move` takes actions where a policy was."""
+    """Builds the functions; see `distill`.
+
+    `is_guided` says that the planner reads Guided; `move` gets actions for a policy.
+    """
     starts = trial_starts(goals.draw, rows)
     goals_of = over_trials(goals.features, rows)
-    plan = jax.vmap(jax.vmap(planner.step, _TRIALS), _TRIALS)
+    axes = Guided(_OWN, _SHARED) if is_guided else _OWN
+    takes = (PlanParams(_SHARED, axes), 0, 0, 0)
+    every = jax.vmap(jax.vmap(planner.step, takes), takes)
+
+    def plan(
+        params: PlanParams, networks: ActorCriticParams, keys: Array, rewards: Any,
+        planning: Any, obs: Array,
+    ) -> tuple[PlanOutput, Any]:  # fmt: skip
+        data = Guided(rewards, networks) if is_guided else rewards
+        return every(PlanParams(params.dynamics, data), keys, planning, obs)
 
     def fresh(data: Any, key: Array, dataset: Dataset) -> tuple[Array, Any, Any]:
         def everywhere(x: Array) -> Array:
@@ -83,9 +97,10 @@ def build_trials(
         key: Array,
     ) -> tuple[DistillState, Asked]:  # fmt: skip
         plan_key, noise_key, move_key, again_key, start_key = jax.random.split(key, 5)
-        known = PlanParams(params.dynamics, state.rewards)
         plan_keys = jax.random.split(plan_key, rows)
-        said, planning = plan(known, plan_keys, state.planning, state.obs)
+        said, planning = plan(
+            params, state.params, plan_keys, state.rewards, state.planning, state.obs
+        )
         wanted = (said.action - box.center) / box.half_width
         seen = networks.see(state.params, goals_of(state.rewards), state.obs)
         own = jnp.tanh(networks.propose(state.params.actor, seen))
@@ -111,4 +126,4 @@ def build_trials(
         square = counts * jnp.mean((own - wanted) ** 2, -1)
         return state, Asked(jnp.sum(square), jnp.sum(value), jnp.sum(counts))
 
-    return Trials(fresh, ask)
+    return Trials(fresh, plan, ask)

@@ -10,7 +10,7 @@ import pytest
 import toys
 
 import jaxpets
-from jaxpets import PlanParams
+from jaxpets import PlanParams, policies
 from jaxpets._src.distill_records import Plans
 from jaxpets._src.distill_update import keep
 from jaxpets.policies import DistillConfig, Goals, Guided
@@ -199,7 +199,8 @@ def test_state_and_members_keep_their_shapes():
         (dict(planned=1.5), ValueError, r"planned must be in \[0, 1\], got 1.5"),
         (dict(horizon=0), ValueError, "horizon must be at least 1, got 0"),
         (dict(goals=3), TypeError, "goals must be a Goals, got"),
-        (dict(planner=3), TypeError, "planner must be a Planner, got"),
+        (dict(planner=3), TypeError, "planner must be a function, got 3"),
+        (dict(planner=lambda *_: 3), TypeError, "planner must be a Planner, got"),
         (dict(dynamics_fn=None), TypeError, "dynamics_fn must be a function, got None"),
         (dict(terminal_fn=1), TypeError, "terminal_fn must be a function, got 1"),
     ],
@@ -215,3 +216,23 @@ def test_wrong_arguments_fail_when_traced():
         distiller.init(params, jax.random.key(0), jaxpets.datasets.init(5, 3, 1))
     with pytest.raises(TypeError, match="state must be a DistillState"):
         distiller.step(params, jax.random.key(0), (), states())
+
+
+def test_a_planner_that_begins_with_the_policy_is_learned_as_well():
+    """It is built from the policy, and reads it as it is now."""
+
+    def planner_of(policy, reward_fn):
+        begins = policies.prior(policy, toys.cart, horizon=HORIZON)
+        rollout = jaxpets.particle_rollout(toys.cart)
+        return jaxpets.plan(rollout, reward_fn, SEARCH, propose_fn=begins)
+
+    distiller, known = build(planner=planner_of), PlanParams(GAIN, TARGETS)
+    state = jax.jit(distiller.init)(known, jax.random.key(0), states())
+    step = jax.jit(distiller.step)
+    for i in range(4):
+        state, metrics = step(known, jax.random.key(i), state, states())
+    assert metrics.num_skipped == 0
+    data = Guided(TARGETS[1], state.params)
+    for planner in (distiller.policy, distiller.planner):
+        path = driven(planner, data, jnp.array([-0.9, 0.5]))
+        assert np.abs(path[-10:] - TARGETS[1]).max() < 0.3
