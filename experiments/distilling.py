@@ -1,9 +1,11 @@
 """Phase 2 in a network: what the planner would do on any task, without a plan.
 
 The planner performs every task; what it sees is data to imagine from. Then, round by
-round, it is asked in imagined trials, the policy learns what it said, and acts once per
-task, from where the next round imagines. At last the policy performs as the planner
-did. What was learned is saved before that, so that a run that was stopped goes on.
+round, it is asked in imagined trials, where its search begins with what the policy would
+do; the policy learns what it said, and acts once per task, from where the next round
+imagines. At last the policy performs as the planner did, and so does the planner that
+begins with it. What was learned is saved before that, so that a run that was stopped
+goes on.
 """
 
 import functools
@@ -36,6 +38,9 @@ from .storage.folder import RunFolder
 
 _KNOWN = jaxpets.PlanParams(P(SEED), P())  # tasks are shared
 _SEEDS = P(SEED)
+# What the log calls who acts: the planner, the policy, and the planner whose search
+# begins with what the policy would do.
+_PLANNER, _POLICY, _BOTH = WHO = ("plan", "policy", "both")
 
 
 class _Run(NamedTuple):
@@ -47,8 +52,7 @@ class _Run(NamedTuple):
     tasks: Tasks
     distiller: Distiller
     placement: Placement
-    planner: Actors
-    policy: Actors
+    actors: Mapping[str, Actors]  # by what the log calls them
     scorer: Scorer
     progress: Progress
     folder: RunFolder
@@ -69,16 +73,18 @@ def distill(
     robot = robots.of(config)
     tasks = robots.chosen(config, robot)
     count = config.eval_trials
-    num_rows = 2 * len(config.seeds) * len(tasks.names) * count
+    num_rows = 3 * len(config.seeds) * len(tasks.names) * count
     if run.performed(num_rows):
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
     say_rollout(run, parts.performed_by)
-    turns = 1 + config.distill.num_rounds
-    progress = Progress(turns * config.task_length, 0, "distill", watch)
+    turns = config.distill.num_rounds
+    progress = Progress((turns + 2) * config.task_length, 0, "distill", watch)
     placement, horizon = placed(run, len(config.seeds)), config.task_planner.horizon
     distiller = make_distiller(config, parts, tasks)
+
+    guided = Guided(P(TASK), cast(Any, _SEEDS))
 
     def actors(planner: jaxpets.Planner, data: Any) -> Actors:
         return acting.evaluators(
@@ -88,23 +94,35 @@ def distill(
 
     now = _Run(
         config, step, parts, tasks, distiller, placement,
-        planner=actors(parts.actor, P(TASK)),
-        policy=actors(distiller.policy, Guided(P(TASK), cast(Any, _SEEDS))),
+        actors={
+            _PLANNER: actors(parts.actor, P(TASK)),
+            _POLICY: actors(distiller.policy, guided),
+            _BOTH: actors(distiller.planner, guided),
+        },
         scorer=acting.scorer(robot), progress=progress, folder=run,
     )  # fmt: skip
     begin = time.monotonic()
     with progress.interruptible():
         found = run.restore(_template(now))
         state = found[1] if found else _explored(now, source)
-        planned = _perform(now, state, 0, count)
+        planned = _perform(now, _PLANNER, state, 0, count)
+        progress.line(_returns(now, "the planner", _rows(now, _PLANNER, planned)))
         if not found:
             learned = _learned(now, state, planned)
             state = exploration.model_of(state)._replace(reward=learned)
             run.save(step, state)
-        acted = _perform(now, state, turns, count)
+        acted = {
+            _PLANNER: planned,
+            _POLICY: _perform(now, _POLICY, state, turns, count),
+            _BOTH: _perform(now, _BOTH, state, turns + 1, count),
+        }
     export(run, config, parts, state.reward)
-    rows = [*_rows(now, "plan", planned), *_rows(now, "policy", acted, count)]
-    paths = records.trajectories(now.scorer, acted, config.seeds, tasks.names)
+    rows = [
+        row
+        for i, who in enumerate(WHO)
+        for row in _rows(now, who, acted[who], i * count)
+    ]
+    paths = records.trajectories(now.scorer, acted[_POLICY], config.seeds, tasks.names)
     run.save_trajectories(paths)
     run.log(rows)
     run.say(_summary(rows, tasks.names, time.monotonic() - begin))
@@ -139,7 +157,7 @@ def _explored(now: _Run, source: RunFolder) -> State:
 
 def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     """Returns the networks `[S]` of the policies."""
-    settings, count = now.config.distill, len(now.tasks.names)
+    settings = now.config.distill
     begin = time.monotonic()
     place = functools.partial(devices.place, now.placement)
     dataset = place(_room(now, state, planned), SEED)
@@ -164,12 +182,10 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
             text = f"{text}  {skipped:.0f} gradient steps were not finite: left out"
         if turn < settings.num_rounds:
             networks = devices.collect(now.placement, learned.params, SEED)
-            acted = _perform(now, state._replace(reward=networks), turn, 1)
+            state = state._replace(reward=networks)
+            acted = _perform(now, _POLICY, state, turn, 1)
             dataset = append(dataset, place(acted.transitions, SEED))
-            scored = [row["return"] for row in _rows(now, "policy", acted)]
-            means = np.mean(np.reshape(scored, (-1, count)), axis=0)
-            named = zip(now.tasks.names, means, strict=True)
-            text = "  ".join([text, *(f"{name} {x:.0f}" for name, x in named)])
+            text = _returns(now, text, _rows(now, _POLICY, acted))
         now.progress.line(f"{text}  {time.monotonic() - begin:.1f} s")
     seconds = time.monotonic() - begin
     plans = settings.num_rounds * settings.horizon * settings.num_trials
@@ -215,17 +231,17 @@ def _append(
     return jax.lax.scan(one, dataset, trials)[0]
 
 
-def _perform(now: _Run, state: State, turn: int, count: int) -> Trials:
-    """Returns trials `[S, K, count]`: of the planner at turn 0, then of the policy."""
+def _perform(now: _Run, who: str, state: State, turn: int, count: int) -> Trials:
+    """Returns trials `[S, K, count]` of who acts, with the keys of a turn."""
     config, place = now.config, functools.partial(devices.place, now.placement)
-    actors, data = now.planner, now.tasks.params
-    if turn:
-        actors, data = now.policy, Guided(data, place(state.reward, SEED))
+    data = now.tasks.params
+    if who != _PLANNER:
+        data = Guided(data, place(state.reward, SEED))
     keys = now.keys(turn, robots.places(now.parts.robot, now.tasks), range(count))
     params = jaxpets.PlanParams(place(state.params, SEED), data)
     num_chunks = config.task_length // config.chunk_length
-    now.progress.compiling(cost.compiling("physics" if turn else "plan"))
-    trials = acting.run(actors, params, keys, num_chunks, now.progress.tick)
+    now.progress.compiling(cost.compiling("physics" if who == _POLICY else "plan"))
+    trials = acting.run(now.actors[who], params, keys, num_chunks, now.progress.tick)
     return devices.collect(now.placement, trials, *AXES)
 
 
@@ -250,17 +266,28 @@ def _rows(now: _Run, who: str, trials: Trials, first: int = 0) -> list[dict[str,
     return records.rows(now.scorer, labels, trials)
 
 
-def _summary(rows: list[dict[str, Any]], names: tuple[str, ...], seconds: float) -> str:
+def _returns(now: _Run, text: str, rows: list[dict[str, Any]]) -> str:
+    """Returns the text with the mean return of every task behind it."""
+    means = _means(rows, now.tasks.names)
+    return "  ".join([text, *(f"{name} {means[name]:.0f}" for name in means)])
+
+
+def _means(rows: list[dict[str, Any]], names: Sequence[str]) -> dict[str, float]:
+    return {
+        name: float(np.mean([x["return"] for x in rows if x["task"] == name]))
+        for name in names
+    }
+
+
+def _summary(rows: list[dict[str, Any]], names: Sequence[str], seconds: float) -> str:
     """Returns the lines that end the phase: of every task, what share is kept."""
+    means = [_means([x for x in rows if x["planner"] == who], names) for who in WHO]
     lines = [f"distilled returns ({seconds:.0f} s):"]
     for name in names:
-        of_task = [row for row in rows if row["task"] == name]
-        planner, policy = (
-            float(np.mean([x["return"] for x in of_task if x["planner"] == who]))
-            for who in ("plan", "policy")
-        )
-        share = f"{policy / planner:.0%}" if planner > 0 else "-"
-        lines.append(
-            f"  {name:12} policy {policy:8.0f}  planner {planner:8.0f}  {share}"
-        )
+        planner, *others = (found[name] for found in means)
+        shown = [f"{WHO[0]} {planner:6.0f}"]
+        for who, mean in zip(WHO[1:], others, strict=True):
+            share = f" ({mean / planner:.0%})" * (planner > 0)
+            shown.append(f"{who} {mean:6.0f}{share}")
+        lines.append(f"  {name:11} {'  '.join(shown)}")
     return "\n".join(lines)

@@ -35,7 +35,7 @@ def make_distiller(config: Config, parts: Parts, tasks: Tasks) -> Distiller:
     )
     plans = settings.num_rounds * settings.num_trials * settings.horizon
     return jaxpets.distill(
-        parts.actor,
+        parts.with_policy,
         parts.model.sample,
         robot.tasks.reward_fn,
         optax.adam(rate),

@@ -3,8 +3,8 @@
 A row is a trial of a seed, and of a task where one is sought:
 
     phase, arm, seed, trial  exploration has planner and steps too, the others task and
-                             explored_trials, the trials behind their model; a distilled
-                             policy acts after the planner, which the row says
+                             explored_trials, the trials behind their model; in distill
+                             the planner is plan, policy, or both
     value                    predicted reward per imagined step
     turns                    net turns of the torso, nose down; left out of a robot of
                              which none are counted

@@ -33,7 +33,7 @@ def test_a_policy_performs_beside_its_planner(explored, capsys):
     folder = explored / f"{FOLDER}-refit"
     rows = runs.rows(folder)
     assert [(row["planner"], row["trial"]) for row in rows] == (
-        [("plan", 1)] * 4 + [("policy", 2)] * 4
+        [("plan", 1)] * 4 + [("policy", 2)] * 4 + [("both", 3)] * 4
     )
     assert {(row["seed"], row["task"]) for row in rows} == {
         (seed, task) for seed in (0, 7) for task in ("forward", "front-flip")
