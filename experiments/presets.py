@@ -76,6 +76,7 @@ PRESETS = {
 
 # What models that come with the code perform with: the laptop's search, further ahead.
 PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
+PRETRAINED_DISTILL = PRESETS["laptop"].distill
 # How `best` performs: a longer refit, of every member on every row, and a search from
 # fewer elites in noise that keeps its direction for a while.
 _BEST_REFIT = TrainingConfig(800, 256, final_rate=0.005, bootstrap=False)
