@@ -90,8 +90,13 @@ def warm(init, i):
 
 
 def planner_case(name):
+    random = jaxpets.random_planner(ENV.action_low, ENV.action_high)
     if name == "random":
-        planner = jaxpets.random_planner(ENV.action_low, ENV.action_high)
+        planner = random
+    elif name == "prior":
+        begins = policies.prior(random, toys.noisy_cart, horizon=3, num_members=2)
+        search = toys.optimizer("icem", horizon=3)
+        planner = jaxpets.plan(NOISY, toys.reach, search, propose_fn=begins)
     else:
         planner = jaxpets.plan(NOISY, toys.reach, toys.optimizer(name, horizon=3))
 
@@ -193,6 +198,7 @@ def distill_case():
 
 CASES = {
     **{f"plan-{n}": functools.partial(planner_case, n) for n in toys.OPTIMIZERS},
+    "plan-prior": lambda: planner_case("prior"),
     "random_planner": lambda: planner_case("random"),
     "random_planner-coloured": coloured_case,
     **{n: functools.partial(optimizer_case, n) for n in toys.OPTIMIZERS},
