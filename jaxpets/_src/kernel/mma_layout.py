@@ -51,6 +51,6 @@ class MmaLayout(GpuLayout):
         numbers = 2 * round_up(self.input_size, 4) + 16 * obs_words
         state = 4 * (obs_words | 1)
         operand = DEPTH * max(chunks(self.input_size), chunks(self.width)) + 8
-        rollout = 6 * 8 + 4 * 4 + 8 + 4 * 6 * 8 + 8  # and which part of it
+        rollout = 6 * 8 + 4 * 4 + 8 + 4 * 6 * 8 + 8 + 4 * 4  # its part, and a key
         row = 4 * 2 * state + 2 * operand + 4 * 2
         return 4 * numbers + _TILE * tiles * row + rollout

@@ -32,7 +32,7 @@ constexpr int SUMS = TILES * Hidden::OWN_SUMS + FOURS * Hidden::REST_SUMS;
 constexpr int FITTING = (200 - SUMS - 4 * TILES) / Hidden::WORDS;
 constexpr int BUFFERS = FITTING < 2 ? 2 : FITTING > 4 ? 4 : FITTING;
 using HiddenStream = Stream<Hidden, WIDE_WEIGHTS, BUFFERS>;
-using HeadStream = Stream<Head, HEAD_WEIGHTS, 4>;
+using HeadStream = Stream<Head, HEAD_WEIGHTS, 8>;
 
 // What a block seldom needs lies in shared memory too: registers are for sums.
 struct alignas(16) Shared {
@@ -42,7 +42,8 @@ struct alignas(16) Shared {
   alignas(16) __half operand[ROWS * STRIDE];  // of the next layer: inputs, activations
   int path_offset[ROWS], action_offset[ROWS];  // of each row
   Rollout rollout;
-  int member, first;  // the block's, and its first particle
+  int member, first;   // the block's, and its first particle
+  uint32_t key[KEY];  // of the step
 };
 
 // The compiler then knows nothing of a number. What follows from it is computed where it
@@ -156,6 +157,7 @@ __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
   }
   __syncthreads();
   for (int i = thread; i < SHARED_NUMBERS; i += THREADS) smem.shared[i] = rollout.shared[i];
+  if (thread < KEY) smem.key[thread] = rollout.keys[thread];
   __syncthreads();
   particles(smem, thread).begin(smem.member, smem.first);
 
@@ -188,10 +190,13 @@ __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
     HeadStream head;
     head.start(head_weights, HIDDEN_CHUNKS, min(pair, HEAD / 8 - 1), lane);
     Block block = particles(smem, thread);
-    block.load_actions(min(step + 1, rollout.horizon - 1));
-    const uint32_t* key = rollout.keys + KEY * step;
+    // What the next step needs is read now, for it comes from far.
+    const int next = min(step + 1, rollout.horizon - 1);
+    block.load_actions(next);
+    const uint32_t next_key = rollout.keys[KEY * next + thread % KEY];
     draw_noise<ROWS * OBS, THREADS, AT_ONCE>(
-        smem.target, key, noise_counter(rollout, key, smem.member, smem.first), thread);
+        smem.target, smem.key,
+        noise_counter(rollout, smem.key, smem.member, smem.first), thread);
     __syncthreads();
     uint32_t rows[TILES];
     while (pair < HEAD / 8) {
@@ -209,6 +214,7 @@ __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
     __syncthreads();
     block.move_all();
     block.write_actions();
+    smem.key[thread % KEY] = next_key;
     append_ones<INPUTS>(smem.operand, thread);
   }
   __syncthreads();
