@@ -7,57 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from layers import layers_of
+from layers import PLACES, SIZES, fragment_place, layers_of, unpacked
 
-from jaxpets._src.kernel import mma_layout
 from jaxpets._src.kernel.mma_layout import MmaLayout
 from jaxpets._src.kernel.wgmma_layout import SHARED_MEMORY, WgmmaLayout
 
-SIZES = {
-    "small": (5, 2, 7, (20, 33)),
-    "one layer": (1, 1, 1, (1,)),
-    "paper": (18, 6, 18, (200, 200, 200, 200)),
-    "narrow first": (3, 2, 4, (8, 64, 24)),
-    "full chunks": (8, 6, 8, (30, 30)),  # 14 inputs and two biases
-}
 WGMMA = {f"wgmma {name}": WgmmaLayout(*sizes) for name, sizes in SIZES.items()}
 LAYOUTS = WGMMA | {f"mma {name}": MmaLayout(*sizes) for name, sizes in SIZES.items()}
 SMALL, PAPER = WGMMA["wgmma small"], WGMMA["wgmma paper"]
-
-
-def block_place(row, column, columns):
-    """Blocks of 8 x 8, 8 columns after 8 columns, for each the upper rows first.
-
-    In a block, column after column.
-    """
-    return ((column // 8) * 2 + row // 8) * 64 + column % 8 * 8 + row % 8
-
-
-def fragment_place(row, column, columns):
-    """What a lane of `mma.m16n8k16` holds as the right operand, of 16 columns or 8.
-
-    That is for each 8 columns, of which a lane has one, two rows of the upper half and two
-    of the lower (PTX ISA, matrix fragments for mma.m16n8k16).
-    """
-    lane = column % 8 * 4 + row % 8 // 2
-    register, half = row // 8, row % 2
-    tiles = np.where(column // 16 * 16 + 8 == columns, 1, 2)  # of which a lane has numbers
-    tile = column // 8 % 2
-    return column // 16 * 256 + ((lane * tiles + tile) * 2 + register) * 2 + half
-
-
-PLACES = {WgmmaLayout: block_place, MmaLayout: fragment_place}
-
-
-def unpacked(numbers, rows, columns, place=block_place):
-    """Reads a matrix `[E, chunks * 16, columns]` from the front; returns the rest.
-
-    Chunks of 16 rows follow one another.
-    """
-    chunks = -(-(rows + 2) // 16)
-    row, column = np.indices((chunks * 16, columns))
-    place = row // 16 * 16 * columns + place(row % 16, column, columns)
-    return numbers[:, place], numbers[:, chunks * 16 * columns :]
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -224,27 +181,6 @@ def test_what_is_too_large_is_said(layout, sizes, problem):
     assert layout(*sizes).problem() == (
         None if layout is MmaLayout and problem == TOO_LARGE else problem
     )
-
-
-def test_two_blocks_share_a_multiprocessor_of_any_gpu_if_they_can():
-    """Of 100 KiB, and CUDA takes one for each block. A large model has fewer particles."""
-    tiles = {}
-    larger = {"quadruped": (60, 12, 63, (256,) * 4), "largest": (128, 128, 128, (256,))}
-    for name, sizes in (SIZES | larger).items():
-        layout = MmaLayout(*sizes)
-        tiles[name] = layout.ring()["TILES"]
-        assert layout.shared_bytes(tiles[name]) <= mma_layout.SHARED_MEMORY
-        assert name in larger or layout.shared_bytes(tiles[name]) <= 49 * 1024
-    assert tiles == dict.fromkeys(SIZES, 5) | {"quadruped": 5, "largest": 3}
-
-
-@pytest.mark.parametrize(
-    ("widest", "width"),
-    [(1, 24), (33, 64), (40, 64), (64, 64), (96, 96), (97, 128), (200, 200), (225, 256)],
-)
-def test_few_columns_are_shared_by_all_warps(widest, width):
-    """Of 64 columns at most 32. More are filled up, so that each warp has some alone."""
-    assert MmaLayout(18, 6, 18, (widest,)).width == width
 
 
 def test_the_header_has_every_constant():

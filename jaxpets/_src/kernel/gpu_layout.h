@@ -27,10 +27,10 @@ constexpr int MEMBER_WEIGHTS =
 // lane's four pairs of rows; for 8 that are left over, each lane's two.
 constexpr int place(int row, int column, int columns) {
   if (!FRAGMENTS) return (column / 8 * 2 + row / 8) * 64 + column % 8 * 8 + row % 8;
-  const int lane = column % 8 * 4 + row % 8 / 2, in_lane = row / 8 * 2 + row % 2;
-  const int first = column / 16 * 256;
-  return column / 16 * 16 + 8 == columns ? first + lane * 4 + in_lane
-                                         : first + lane * 8 + column % 16 / 8 * 4 + in_lane;
+  const bool is_alone = column / 16 * 16 + 8 == columns;
+  const int lane = column % 8 * 4 + row % 8 / 2;
+  const int in_lane = column % 16 / 8 * 4 + row / 8 * 2 + row % 2;
+  return column / 16 * 256 + lane * (is_alone ? 4 : 8) + in_lane;
 }
 
 // The head's columns of an entry. In fragments a lane has both in one piece.

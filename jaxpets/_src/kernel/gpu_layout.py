@@ -197,13 +197,13 @@ def _fragments(matrix: IntArray) -> IntArray:
     two rows. Eight columns that are left over are as 16, but for the halves.
     """
     height, columns = matrix.shape
-    numbers = height // DEPTH
+    count, pairs = height // DEPTH, columns // 16
     # A lane has a column and every fourth pair of rows.
-    tiles = matrix.reshape(numbers, 2, 4, 2, columns // 8, 8).transpose(0, 4, 5, 2, 1, 3)
-    even = columns // 16 * 2
-    pairs = tiles[:, :even].reshape(numbers, even // 2, 2, 32, 4).transpose(0, 1, 3, 2, 4)
-    rest = tiles[:, even:].reshape(numbers, -1)
-    return np.concatenate([pairs.reshape(numbers, -1), rest], axis=1).ravel()
+    eights = matrix.reshape(count, 2, 4, 2, columns // 8, 8)
+    eights = eights.transpose(0, 4, 5, 2, 1, 3)
+    paired = eights[:, : 2 * pairs].reshape(count, pairs, 2, 32, 4).swapaxes(2, 3)
+    parts = [paired.reshape(count, -1), eights[:, 2 * pairs :].reshape(count, -1)]
+    return np.concatenate(parts, axis=1).ravel()
 
 
 def _half(array: Array) -> Array:

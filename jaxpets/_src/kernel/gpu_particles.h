@@ -1,4 +1,4 @@
-// What some threads do with their particles in every step, but for the products of layers:
+// What threads do with their particles in every step, but for the products of layers:
 // inputs, activations, noise and moves. For Hopper's kernel and the one of other GPUs.
 #pragma once
 
@@ -79,7 +79,8 @@ __device__ __forceinline__ void store(float* to, const float* from, bool wanted)
 }
 
 // Turns means and raw log-variances into draws; the noise stands where they go. Mean and
-// log-variance of one entry lie in the same thread, entries two by two. Of `entries` in all.
+// log-variance of one entry lie in the same thread, entries two by two. There are
+// `entries` in all.
 template <int COLUMNS>
 __device__ __forceinline__ void draw_targets(float* target, const float (&head)[COLUMNS],
                                              const float* shared, int pair, int entries) {

@@ -1,9 +1,9 @@
 // Products of a block's particles with weights, for mma_rollout.cu.
 //
-// Every warp of a block multiplies all of its particles by some of the columns. So no two
-// warps read the same weights, and weights go from L2 straight to the registers of the
-// warp that needs them, in the order in which its lanes hold them: they need neither
-// shared memory nor barriers, and each is read once for all particles of the block.
+// Every warp of a block multiplies all of its particles by some of the columns. So hardly
+// any weights are for two warps, and they go from L2 straight to the registers of the one
+// that needs them, in the order in which its lanes hold them: they need neither shared
+// memory nor barriers, and each is read once for all particles of the block.
 #pragma once
 
 #include <cstdint>
@@ -34,7 +34,8 @@ __device__ __forceinline__ void add_product(float* sums, const uint32_t (&a)[4],
 }
 
 // Reads a lane's weights of 16 columns, or of 8, if they are wanted. No branch.
-__device__ __forceinline__ void load_pair(uint32_t* to, const uint16_t* from, int wanted) {
+__device__ __forceinline__ void load_pair(uint32_t* to, const uint16_t* from,
+                                          int wanted) {
   asm volatile(
       "{\n.reg .pred wanted;\nsetp.ne.b32 wanted, %5, 0;\n"
       "@wanted ld.global.nc.v4.u32 {%0, %1, %2, %3}, [%4];\n}"
@@ -51,13 +52,13 @@ __device__ __forceinline__ void load_single(uint32_t* to, const uint16_t* from,
       : "l"(from), "r"(wanted));
 }
 
-// A warp's share of the columns: pairs of 8 that are its own, and single ones that are
-// left over. Of those every warp multiplies only some tiles of rows.
+// A warp's share of the columns: pairs of 8 that are its own, and single ones, the rest,
+// that are left over. By those every warp multiplies only some tiles of rows.
 template <int OWN_PAIRS, int LEFT_OVER>
 struct Share {
   static constexpr int PAIRS = OWN_PAIRS, REST = LEFT_OVER;
   static constexpr int WORDS = 4 * PAIRS + 2 * REST;  // of a lane and chunk
-  static constexpr int OWN_SUMS = 4 * 2 * PAIRS, REST_SUMS = 4 * REST;  // sums, of a tile
+  static constexpr int OWN_SUMS = 4 * 2 * PAIRS, REST_SUMS = 4 * REST;  // of a tile
 };
 // Of a hidden layer, and of the head, which is multiplied a pair at a time.
 using Hidden = Share<WIDTH / 16 / WARPS, WIDTH / 8 % (2 * WARPS)>;
@@ -75,6 +76,7 @@ __device__ __forceinline__ int tile_of(int index, int warp) {
   return four * WARPS + (index % WARPS + warp) % tiles_of(four);
 }
 
+// A lane's sums: of a row +0 two columns, of the row +8 the same, then the next columns.
 template <typename Part>
 struct Sums {
   float own[TILES][Part::OWN_SUMS > 0 ? Part::OWN_SUMS : 1];
@@ -98,7 +100,8 @@ struct Stream {
   const uint16_t *own, *rest;  // where the lane's weights lie in a chunk
   uint32_t words[BUFFERS][Part::WORDS];
 
-  // Begins with a layer, and a warp's first pair there. To be called long before `multiply`.
+  // Begins with a layer, of which `pair` is the warp's first. To be called long before
+  // the products.
   __device__ __forceinline__ void start(const uint16_t* layer, int chunks, int pair,
                                         int lane) {
     own = layer + 256 * pair + 8 * lane;
@@ -133,8 +136,8 @@ struct Stream {
 // addresses in each tile of the operand, and are moved.
 template <typename Part, int STRIDE, int BUFFERS>
 __device__ __forceinline__ void multiply(Sums<Part>& sums, uint32_t (&rows)[TILES],
-                                         Stream<Part, STRIDE, BUFFERS>& stream, int chunks,
-                                         int lane) {
+                                         Stream<Part, STRIDE, BUFFERS>& stream,
+                                         int chunks, int lane) {
   uint32_t a[TILES][4];
 #pragma unroll
   for (int tile = 0; tile < TILES; ++tile) load_operand(a[tile], rows[tile]);

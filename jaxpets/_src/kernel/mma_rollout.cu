@@ -2,9 +2,9 @@
 //
 // A block owns up to 80 particles of one member for all H steps. Its four warps share the
 // columns of every layer, not the rows: each warp multiplies all particles by its own
-// weights, which so come from L2 once a step for 80 particles and need no shared memory.
-// Activations lie there instead, as the left operand of the next layer. A layer has two
-// barriers: when all warps have read what it overwrites, and when all have written.
+// weights, which so come from L2 once a step for all and need no shared memory. There lie
+// the activations, as the left operand of the next layer. A layer has two barriers: when
+// all warps have read what it overwrites, and when all have written.
 //
 // A block is small enough for two of them on a multiprocessor of any GPU: while one
 // squashes, draws noise or waits, the other keeps the tensor cores busy.
@@ -22,14 +22,16 @@ namespace {
 constexpr int ROWS = TILES * TILE;  // particles of a block
 constexpr int THREADS = 32 * WARPS;
 constexpr int CHUNKS = INPUT_CHUNKS > HIDDEN_CHUNKS ? INPUT_CHUNKS : HIDDEN_CHUNKS;
-// Of an operand's rows: an odd number of 16 byte words, so that 8 rows are read at once.
+// Of an operand's rows: an odd number of 16 byte words, for 8 rows to be read at once.
 constexpr int STRIDE = CHUNKS * DEPTH + 8;
-constexpr int WIDE_WEIGHTS = DEPTH * WIDTH, HEAD_WEIGHTS = DEPTH * 2 * HEAD;  // of a chunk
+// Of a chunk.
+constexpr int WIDE_WEIGHTS = DEPTH * WIDTH, HEAD_WEIGHTS = DEPTH * 2 * HEAD;
 
 using Block = Particles<ROWS, THREADS, STRIDE>;
-// Chunks come from L2 in about the time of two products; if registers are left for them.
+// Chunks come from L2 in the time of two or three products; if registers are left for so
+// many. These numbers are of 255.
 constexpr int SUMS = TILES * Hidden::OWN_SUMS + FOURS * Hidden::REST_SUMS;
-constexpr int FITTING = (200 - SUMS - 4 * TILES) / Hidden::WORDS;
+constexpr int FITTING = (204 - SUMS - 4 * TILES) / Hidden::WORDS;
 constexpr int BUFFERS = FITTING < 2 ? 2 : FITTING > 4 ? 4 : FITTING;
 using HiddenStream = Stream<Hidden, WIDE_WEIGHTS, BUFFERS>;
 using HeadStream = Stream<Head, HEAD_WEIGHTS, 8>;
@@ -42,7 +44,7 @@ struct alignas(16) Shared {
   alignas(16) __half operand[ROWS * STRIDE];  // of the next layer: inputs, activations
   int path_offset[ROWS], action_offset[ROWS];  // of each row
   Rollout rollout;
-  int member, first;   // the block's, and its first particle
+  int member, first;  // the block's, and its first particle
   uint32_t key[KEY];  // of the step
 };
 
@@ -57,10 +59,11 @@ template <int COLUMN>
 __device__ __forceinline__ void append_ones(__half* operand, int thread) {
   constexpr int COUNT = DEPTH * ((COLUMN + 2 + DEPTH - 1) / DEPTH) - COLUMN;
   for (int i = thread; i < ROWS * COUNT; i += THREADS)
-    operand[i / COUNT * STRIDE + COLUMN + i % COUNT] = __half(i % COUNT < 2 ? 1.0f : 0.0f);
+    operand[i / COUNT * STRIDE + COLUMN + i % COUNT] =
+        __half(i % COUNT < 2 ? 1.0f : 0.0f);
 }
 
-// A warp's activations of a layer, rounded: two to a word, rows +0 and +8 in turn.
+// A warp's activations of a layer, rounded: two to a word, in the order of the sums.
 struct Activations {
   static constexpr int OWN = Hidden::OWN_SUMS / 2, REST = Hidden::REST_SUMS / 2;
   uint32_t own[TILES][OWN > 0 ? OWN : 1], rest[FOURS][REST > 0 ? REST : 1];
@@ -156,7 +159,8 @@ __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
     smem.first = blockIdx.x % blocks * ROWS;
   }
   __syncthreads();
-  for (int i = thread; i < SHARED_NUMBERS; i += THREADS) smem.shared[i] = rollout.shared[i];
+  for (int i = thread; i < SHARED_NUMBERS; i += THREADS)
+    smem.shared[i] = rollout.shared[i];
   if (thread < KEY) smem.key[thread] = rollout.keys[thread];
   __syncthreads();
   particles(smem, thread).begin(smem.member, smem.first);
