@@ -176,12 +176,9 @@ struct Particles {
     }
   }
 
-  // Puts the particles from `first` on where they start, with their first inputs.
+  // Puts the particles from `first` on where they start, with their first inputs. What
+  // stands behind these is the caller's.
   __device__ __forceinline__ void begin(int member, int first) {
-    for (int i = thread; i < ROWS * INPUT_STRIDE; i += THREADS) {
-      const int column = i % INPUT_STRIDE;
-      inputs[i] = column == INPUTS || column == INPUTS + 1 ? __half(1.0f) : __half(0.0f);
-    }
     if (thread < ROWS) {
       const int rows = rollout.num_candidates * rollout.particles;
       const int wanted = first + thread;

@@ -164,6 +164,7 @@ __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
   if (thread < KEY) smem.key[thread] = rollout.keys[thread];
   __syncthreads();
   particles(smem, thread).begin(smem.member, smem.first);
+  append_ones<INPUTS>(smem.operand, thread);
 
   const uint16_t* const weights = rollout.weights + int64_t(smem.member) * MEMBER_WEIGHTS;
   HiddenStream stream;

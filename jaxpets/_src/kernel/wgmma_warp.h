@@ -17,6 +17,15 @@ __device__ __forceinline__ void append_ones(uint32_t (&activations)[4 * HIDDEN_C
 }
 
 struct Warp : Particles<ROWS, 32, INPUT_STRIDE> {
+  // Behind the inputs stand two ones and zeros, from beginning to end.
+  __device__ __forceinline__ void begin(int member, int first) {
+    for (int i = thread; i < ROWS * INPUT_STRIDE; i += 32) {
+      const int column = i % INPUT_STRIDE;
+      inputs[i] = column == INPUTS || column == INPUTS + 1 ? __half(1.0f) : __half(0.0f);
+    }
+    Particles::begin(member, first);
+  }
+
   // Reads the inputs as the left operand of the first layer.
   __device__ __forceinline__ void read_inputs(uint32_t (&operand)[4 * INPUT_CHUNKS]) {
     const __half* from = inputs + thread / 4 * INPUT_STRIDE + 2 * (thread % 4);
