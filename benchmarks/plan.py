@@ -78,6 +78,7 @@ def measure(
         seeds=seeds,
         engine=engine,
         arch=workloads.arch(size, precision, engine),
+        awaited=args.plans == 1,
         ms_per_plan=result.median_ms / plans,
         **result._asdict(),
         gflop=flops / 1e9,

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -33,6 +34,7 @@ def environment() -> dict[str, Any]:
         "date": now.isoformat(timespec="seconds"),
         "device": device,
         "cpus": os.cpu_count(),
+        "git": _commit(),
         "versions": versions,
     }
 
@@ -79,6 +81,18 @@ def positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
     return number
+
+
+def _commit() -> str | None:
+    """Returns which code this is, where it is a checkout."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    folder = Path(__file__).parent
+    try:
+        return subprocess.check_output(
+            command, cwd=folder, stderr=subprocess.DEVNULL, text=True
+        ).strip()
+    except (OSError, subprocess.CalledProcessError):  # no git, or no checkout
+        return None
 
 
 def _text(cell: Any) -> str:

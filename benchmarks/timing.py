@@ -1,5 +1,6 @@
 """Compile time apart from run time, and one callable against another."""
 
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -14,6 +15,7 @@ class Timing(NamedTuple):
     compile_s: float  # tracing, lowering and compiling
     min_ms: float  # of `repeats` runs
     median_ms: float
+    p99_ms: float  # of fewer than 100 runs the slowest
     repeats: int
 
 
@@ -46,8 +48,9 @@ def seconds(call: Callable[[], Any]) -> float:
 def repeat(call: Callable[[], Any], compile_s: float = 0.0, *, repeats: int) -> Timing:
     """Runs something compiled once unmeasured and then `repeats` times."""
     seconds(call)
-    times = [seconds(call) for _ in range(repeats)]
-    return Timing(compile_s, 1e3 * min(times), 1e3 * statistics.median(times), repeats)
+    times = sorted(1e3 * seconds(call) for _ in range(repeats))
+    p99 = times[math.ceil(0.99 * repeats) - 1]
+    return Timing(compile_s, times[0], statistics.median(times), p99, repeats)
 
 
 def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:

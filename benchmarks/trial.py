@@ -43,6 +43,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             compile_s=act.compile_s + learn.compile_s,
             min_ms=act.min_ms + learn.min_ms,
             median_ms=act.median_ms + learn.median_ms,
+            p99_ms=act.p99_ms + learn.p99_ms,
             repeats=repeats,
             unroll_s=act.median_ms / 1e3,
             ms_per_step=act.median_ms / steps,

@@ -119,6 +119,8 @@ class PlannerConfig:
     """Iterations per step."""
     num_particles: Annotated[int, Meta(ge=1, le=100_000)] = 20
     """Particles per candidate, over all members."""
+    means: bool = False
+    """Imagine the members' means, not draws; a particle for each is then enough."""
     momentum: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.1
     """Share of the old mean and variance that an iteration keeps."""
     legacy_variance: bool = False

@@ -76,12 +76,25 @@ def jobs(sweep: Sweep) -> Iterator[Job]:
         commands = [["explore", *own, *_line(flags)]]
         # A user's file has to be named again, since no run's config may name one.
         own += _line({x: flags[x] for x in ("env", "arm") if x in flags})
-        for later in sweep.then:
+        for later in itertools.chain.from_iterable(map(_variants, sweep.then)):
             grid, rest = _split(later)
             if _is_at(place, grid):
                 phase, *rest = _phase(rest)
                 commands.append([phase, *own, *rest])
         yield Job(name, commands)
+
+
+def _variants(later: Flags) -> Iterator[Flags]:
+    """Returns a later phase once for each combination of what it varies, if anything.
+
+    What its values say goes into the tag, so that each has a folder of its own.
+    """
+    flags = dict(later)
+    vary = _table("vary", flags)
+    for values in itertools.product(*vary.values()):
+        chosen = dict(zip(vary, values, strict=True))
+        words = [str(x) for x in (flags.get("tag"), *map(_words, values)) if x]
+        yield flags | chosen | ({"tag": "-".join(words)} if vary else {})
 
 
 def _is_at(place: Mapping[str, Any], grid: Grid) -> bool:
@@ -92,10 +105,15 @@ def _is_at(place: Mapping[str, Any], grid: Grid) -> bool:
 def _split(later: Flags) -> tuple[Grid, Flags]:
     """Returns for which runs a later phase is, and its flags."""
     flags = dict(later)
+    return _table("grid", flags), flags
+
+
+def _table(name: str, flags: Flags) -> Grid:
+    """Takes a table of lists out of a later phase, an empty one if there is none."""
     try:
-        return msgspec.convert(flags.pop("grid", {}), Grid), flags
+        return msgspec.convert(flags.pop(name, {}), Grid)
     except msgspec.ValidationError as error:
-        raise UsageError(f"then.grid is not valid: {error}") from error
+        raise UsageError(f"then.{name} is not valid: {error}") from error
 
 
 def _phase(later: Flags) -> list[str]:

@@ -53,7 +53,8 @@ A sweep is a file like this:
   grid.env = ["dmc/walker"]   # for these alone
   phase = "zero-shot"
   task = "stand,walk"
-  task-planner.horizon = 30
+  tag = "horizon"             # once for each: horizon-20 and horizon-30
+  vary."task-planner.horizon" = [20, 30]
 
   [slurm]                     # of submitit, with --slurm
   slurm_partition = "gpu"

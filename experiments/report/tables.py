@@ -81,7 +81,12 @@ def tasks_of(rows: Iterable[Row]) -> list[str]:
     for row in rows:
         own = [row.task] if row.task else []
         found |= dict.fromkeys([*(row.data.get("returns") or {}), *own])
-    return sorted(found, key=lambda x: TASKS.index(x) if x in TASKS else len(TASKS))
+    return tasks_in_order(found)
+
+
+def tasks_in_order(tasks: Iterable[str]) -> list[str]:
+    """Sorts tasks: those of the paper first, the others as they come."""
+    return sorted(tasks, key=lambda x: TASKS.index(x) if x in TASKS else len(TASKS))
 
 
 def table_1(

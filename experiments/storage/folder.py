@@ -6,6 +6,7 @@ reads or fails at gets to the others.
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +47,11 @@ class RunFolder(NamedTuple):
     def steps(self) -> list[int]:
         """Returns the trials that have a checkpoint, oldest first."""
         return distributed.on_first(lambda: checkpoint.steps(self._checkpoints))
+
+    def below(self, pattern: str) -> list["RunFolder"]:
+        """Returns the folders in this one that have such a name, and a config."""
+        names = distributed.on_first(partial(rundir.below, self.path, pattern))
+        return [RunFolder(self.path / name) for name in names]
 
     def find_json(self, name: str) -> dict[str, Any]:
         """Returns the object in a file of this name, an empty one if there is none."""
@@ -93,13 +99,8 @@ class RunFolder(NamedTuple):
         """
         found = self._restore(template, None, False)
         last, meta = (found[0], found[2]) if found else (first, {})
-        num_rows = meta.get("rows")
-        num_rows = (
-            num_rows if type(num_rows) is int else None
-        )  # a stranger's may not be
-        for line in distributed.on_first(
-            lambda: metrics.resume(self._log, first, last, num_rows)
-        ):
+        resume = partial(metrics.resume, self._log, first, last, meta.get("rows"))
+        for line in distributed.on_first(resume):
             self.say(f"warning: {line}")
         return found[:2] if found else None
 

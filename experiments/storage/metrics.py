@@ -178,19 +178,20 @@ def rows_by_trial(path: Path) -> Counter[int]:
     return Counter(trial for _, trial in _trials(path) if trial is not None)
 
 
-def resume(path: Path, first: int, last: int, num_rows: int | None) -> list[str]:
+def resume(path: Path, first: int, last: int, num_rows: Any) -> list[str]:
     """Cuts a log back to a checkpoint; returns what is to be said of it, as lines.
 
     Args:
       path: The log; what it has lost costs rows, and never the run.
       first: The trial before those of the run.
       last: The trial of the checkpoint; `first` if there is none.
-      num_rows: Of every trial; None if the checkpoint does not say.
+      num_rows: Of every trial, as the checkpoint says; a stranger's may say anything.
     """
     before = rows_by_trial(path)
     cut_log(path, last)
     found = rows_by_trial(path)
-    num_rows = num_rows or max(found.values(), default=1)
+    if type(num_rows) is not int or not num_rows:
+        num_rows = max(found.values(), default=1)
     lost = [trial for trial in range(first + 1, last + 1) if found[trial] < num_rows]
     if lost:
         return [

@@ -187,6 +187,11 @@ def find_json(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def below(folder: Path, pattern: str) -> list[str]:
+    """Returns the names of the folders in one that have such a name, and a config."""
+    return sorted(path.parent.name for path in folder.glob(f"{pattern}/{CONFIG}"))
+
+
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
 

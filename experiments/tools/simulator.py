@@ -34,6 +34,8 @@ class Arguments:
 
     env: str = rundir.HALF_CHEETAH
     """The robot, as `experiments.run` takes it."""
+    tasks: str | None = None
+    """FILE.py of your own: its tasks in place of the robot's."""
     seed: int = 0
     """Of all keys."""
     num_trials: int = 1
@@ -86,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Performs, and prints a line per task; returns the exit code."""
     args = tyro.cli(Arguments, args=argv, prog=f"{__package__}.simulator")
     try:
-        robot = robots.named(args.env, args.engine)
+        robot = robots.named(args.env, args.engine, args.tasks)
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

@@ -107,8 +107,8 @@ def results(runs: Path, explored: int, tag: str) -> Results:
             steps = explored * _trial_steps(configs[own[0].run])
             for task in tasks:
                 if task in scores:
-                    numbers = _numbers(scores[task], steps)
-                    found.setdefault(arm, {})[_name(domain, task)] = numbers
+                    own_numbers = numbers(scores[task], steps)
+                    found.setdefault(arm, {})[_name(domain, task)] = own_numbers
     return found
 
 
@@ -117,7 +117,7 @@ def table(found: Results, peers: Peers) -> list[str]:
     arms = tables.in_order(found)
     columns = [(x, i) for x in peers.systems for i in (0, -1)]
     lines = [
-        [name, *(_cell(found[arm].get(name)) for arm in arms)]
+        [name, *(cell(found[arm].get(name)) for arm in arms)]
         + [f"{peers.returns[x.name][name][i]:.0f}" for x, i in columns]
         for name in NAMES
     ]
@@ -153,7 +153,8 @@ def _trial_steps(config: Mapping[str, Any]) -> int:
     return int(config["trial_length"]) * repeat
 
 
-def _numbers(scores: Mapping[int, float], steps: int) -> dict[str, Any]:
+def numbers(scores: Mapping[int, float], steps: int) -> dict[str, Any]:
+    """Returns mean, interval and each seed's mean; `steps` are of exploration."""
     summary = stats.summarize(np.array(list(scores.values()), float))
     interval = summary.ci95 if summary else None
     return {
@@ -164,31 +165,32 @@ def _numbers(scores: Mapping[int, float], steps: int) -> dict[str, Any]:
     }
 
 
-def _cell(numbers: Mapping[str, Any] | None) -> str:
-    if numbers is None:
+def cell(found: Mapping[str, Any] | None) -> str:
+    """Returns mean and interval of `numbers`, for a table."""
+    if found is None:
         return "-"
-    if numbers["mean"] is None:
+    if found["mean"] is None:
         return "not finite"
-    text = f"{numbers['mean']:.0f}"
-    if numbers["interval"]:
-        text += " [{:.0f}, {:.0f}]".format(*numbers["interval"])
+    text = f"{found['mean']:.0f}"
+    if found["interval"]:
+        text += " [{:.0f}, {:.0f}]".format(*found["interval"])
     return text
 
 
-def _mean(numbers: Mapping[str, Mapping[str, Any]]) -> str:
+def _mean(found: Mapping[str, Mapping[str, Any]]) -> str:
     """Returns the mean of tasks, and of how many if some are missing.
 
     With an interval over seeds if all tasks have the same: a seed's mean is one number.
     """
-    seeds = {frozenset(x["seeds"]) for x in numbers.values()}
+    seeds = {frozenset(x["seeds"]) for x in found.values()}
     of_seeds = [
-        statistics.mean(x["seeds"][seed] for x in numbers.values())
+        statistics.mean(x["seeds"][seed] for x in found.values())
         for seed in sorted(seeds.pop() if len(seeds) == 1 else ())
     ]
-    mean = statistics.mean(x["mean"] for x in numbers.values())
+    mean = statistics.mean(x["mean"] for x in found.values())
     interval = stats.t_interval(np.array(of_seeds))
-    text = _cell({"mean": mean, "interval": interval})
-    return text if len(numbers) == len(NAMES) else f"{text} (of {len(numbers)})"
+    text = cell({"mean": mean, "interval": interval})
+    return text if len(found) == len(NAMES) else f"{text} (of {len(found)})"
 
 
 if __name__ == "__main__":

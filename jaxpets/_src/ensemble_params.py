@@ -8,6 +8,9 @@ from jax import Array
 from jaxpets._src.checks import check_record
 from jaxpets._src.ensemble_config import EnsembleConfig
 
+# A log-variance of next to nothing; as a variance and inverted it is a float32 still.
+_NOTHING = -80.0
+
 
 class NetworkParams(NamedTuple):
     """What gradients train in an ensemble of `jaxpets.ensemble`.
@@ -56,6 +59,24 @@ def max_variance(params: EnsembleParams) -> Array:
     """Returns `exp(max_logvar)` `[D]` in units of obs squared: the paper's w_base."""
     check_record("params", params, EnsembleParams)
     return jnp.exp(params.network.max_logvar)
+
+
+def without_noise(params: EnsembleParams) -> EnsembleParams:
+    """Returns the parameters of a model that imagines its members' means.
+
+    Particles then differ by their members alone, `s_{h+1} = mean_{b(p)}(s_h, a_h)`: one
+    for each member is enough, and a search ranks its candidates by what they do, and
+    not also by what was drawn for them. The paper draws (section 3.2), which shows a
+    task that noise matters to what may happen. For planning, not for training.
+
+    Raises:
+      TypeError: unless params are those of an ensemble of `jaxpets.ensemble`.
+    """
+    check_record("params", params, EnsembleParams)
+    check_record("params.network", params.network, NetworkParams)
+    nothing = jnp.full_like(params.network.max_logvar, _NOTHING)
+    network = params.network._replace(min_logvar=nothing, max_logvar=nothing)
+    return params._replace(network=network)
 
 
 def imagined_range(config: EnsembleConfig, scaler: Scaler) -> tuple[Array, Array]:

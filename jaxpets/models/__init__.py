@@ -1,9 +1,10 @@
-"""Models that come with the library, and what a file says about its model.
+"""Models that come along, what a file says about its model, and a model without noise.
 
 `jaxpets.save_model`, `jaxpets.load_model` and `jaxpets.pretrained` write and read them.
 """
 
+from jaxpets._src.ensemble_params import without_noise
 from jaxpets._src.model_file import about
 from jaxpets._src.pretrained import names, path
 
-__all__ = ["about", "names", "path"]
+__all__ = ["about", "names", "path", "without_noise"]

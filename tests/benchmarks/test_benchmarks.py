@@ -26,8 +26,8 @@ from benchmarks import (
 from benchmarks import all as all_benchmarks
 from benchmarks import rows as rows_module
 
-ENVIRONMENT = {"benchmark", "date", "device", "cpus", "versions", "sizes"}
-TIMING = {"compile_s", "min_ms", "median_ms", "repeats"}
+ENVIRONMENT = {"benchmark", "date", "device", "cpus", "git", "versions", "sizes"}
+TIMING = {"compile_s", "min_ms", "median_ms", "p99_ms", "repeats"}
 
 
 def check_rows(found, path, results, labels=()):
@@ -38,7 +38,7 @@ def check_rows(found, path, results, labels=()):
         assert set(row) == ENVIRONMENT | TIMING | {*results, *labels}
         assert row["device"] == jax.devices()[0].device_kind
         assert row["versions"]["jax"] == jax.__version__
-        assert 0 < row["min_ms"] <= row["median_ms"]
+        assert 0 < row["min_ms"] <= row["median_ms"] <= row["p99_ms"]
         assert all(row[name] > 0 for name in results)
 
 
@@ -95,6 +95,7 @@ def test_repeat_leaves_the_first_run_out():
     assert len(runs) == 4
     assert result.compile_s == 2.0 and result.repeats == 3
     assert result.min_ms <= result.median_ms < 50.0  # one slow run of three
+    assert result.p99_ms > 50.0
 
 
 def test_work_of_the_paper_is_what_is_published():
@@ -114,6 +115,7 @@ def test_plan_over_seeds_and_samples(tmp_path):
         "dtype": "bf16",
         "engine": "scan",
         "arch": "",
+        "awaited": True,
         "seeds": 2,
     }
     common = ["--tiny", "--repeats", "2", "--json", str(path)]
@@ -309,7 +311,7 @@ def test_a_trace_is_summed_over_the_streams_of_the_gpu():
     assert found == {"rollout_kernel": (42.0, 2), "sort": (1.0, 1)}
     programs = {name: (10 * us, n) for name, (us, n) in found.items()}
     row = trace._row(
-        workloads.named_size("tiny"), 4, timing.Timing(1, 2, 2, 3), programs
+        workloads.named_size("tiny"), 4, timing.Timing(1, 2, 2, 2, 3), programs
     )
     assert row["rollout_us"] == 42.0 and row["busy_us"] == 43.0
     assert row["outside"] == pytest.approx(1 / 43)

@@ -90,6 +90,28 @@ def test_a_stopped_zero_shot_does_not_refit_again(
 
 
 @pytest.mark.slow
+def test_a_variant_takes_the_refit_of_another(performed, explored, tmp_path, capsys):
+    """It is the same fit with the same keys; of other settings it is another one."""
+    again = tmp_path / runs.NAME
+    shutil.copytree(explored, again)
+    command = ["--phase", "zero-shot", "--from", str(again), *FLAGS]
+    assert main([*command, "--tag", "longer", "--refit.num-epochs", "4"]) == 0
+    assert "refit: 4 epochs" in capsys.readouterr().err
+    variant = ["--tag", "pessimist", "--pessimism", "0.5"]
+    assert main([*command, *variant]) == 0
+    assert f"refit: as in {TASK}\n" in capsys.readouterr().err
+    config = cli.parse(command)
+    wanted, found = model(performed, config), model(again / f"{TASK}-pessimist", config)
+    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+    # A damaged one is not used, and costs the time of a refit.
+    for folder in (again / TASK, again / f"{TASK}-pessimist"):
+        for file in (folder / "checkpoints").rglob("d/*"):
+            file.write_bytes(b"")
+    assert main([*command, "--tag", "third", "--pessimism", "0.2"]) == 0
+    assert SAID in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_finetune_refits_once(explored, tmp_path, capsys):
     again = tmp_path / runs.NAME
     shutil.copytree(explored, again, ignore=shutil.ignore_patterns("zero-shot*"))

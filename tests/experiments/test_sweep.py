@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 import runs
 
-from experiments import grid, sweep
+from experiments import cli, grid, sweep
 from experiments.grid import Job
+from experiments.storage import rundir
 
 FILE = """
 out = "{out}"
@@ -76,6 +77,43 @@ def test_lists_are_words_and_the_last_entry_is_the_fastest(file):
     assert " ".join(explore[3:]) == "--name 0-1-b-f --seeds 0 1 --env my/b.py:f"
 
 
+VARIED = """
+[[then]]
+phase = "zero-shot"
+tag = "s"
+vary."task-planner.optimizer" = ["cem", "icem"]
+vary."task-planner.num-samples" = [8, 16]
+[[then]]
+phase = "zero-shot"
+task = "forward"
+vary.pessimism = [0.5]
+"""
+
+
+def test_a_phase_is_varied_and_each_has_its_tag(file):
+    random, _ = grid.jobs(grid.read(file(FILE + VARIED)))
+    *four, last = [" ".join(command) for command in random.commands[1:]]
+    searches = [(name, count) for name in ("cem", "icem") for count in (8, 16)]
+    for said, (name, count) in zip(four, searches, strict=True):
+        assert f"--tag s-{name}-{count}" in said
+        assert f"--task-planner.optimizer {name}" in said
+        assert f"--task-planner.num-samples {count}" in said
+    assert "--task forward --pessimism 0.5 --tag 0.5" in last
+
+
+@pytest.mark.parametrize("name", ["dmc20", "study", "search"])
+def test_the_files_of_tables_are_valid(name, monkeypatch):
+    """Flags and tags, of every run and phase; --list would read the robots as well."""
+    monkeypatch.chdir(Path(sweep.__file__).parents[1])  # where their commands are given
+    jobs = list(grid.jobs(grid.read(Path("experiments/sweeps") / f"{name}.toml")))
+    for job in jobs[:: max(1, len(jobs) // 3)]:
+        explored = cli.parse(job.commands[0])
+        found = [cli.parse(command, explored) for command in job.commands[1:]]
+        folders = [cli.variant(config, explored.num_trials) for config in found]
+        assert len(set(folders)) == len(folders)
+        assert all(rundir.check_name(folder) is None for folder in folders)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -94,6 +132,7 @@ def test_lists_are_words_and_the_last_entry_is_the_fastest(file):
         (FILE + '[[then]]\nphase = "explore"', "then.phase 'explore'"),
         (FILE + '[[then]]\nphase = "zero-shot"\neval-trials = 0', "--eval-trials 0"),
         (FILE + '[[then]]\nphase = "zero-shot"\ngrid.arm = 3', "then.grid"),
+        (FILE + '[[then]]\nphase = "zero-shot"\nvary.task = []', "then.vary"),
     ],
 )
 def test_what_is_not_valid_is_refused_before_anything_runs(

@@ -23,6 +23,7 @@ import jaxpets
 from jaxpets import Precision
 from jaxpets._src.chunks import window
 from jaxpets.envs import half_cheetah as hc
+from jaxpets.models import without_noise
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -90,6 +91,18 @@ def test_noise_is_that_of_jax_random_number_by_number(engine):
         np.testing.assert_allclose(
             moves[:, h], noise.swapaxes(0, 1) * std, rtol=1e-5, atol=2e-6
         )
+
+
+def test_without_noise_all_particles_of_a_member_are_one(engine):
+    """Also in the kernel: what it multiplies its draws with is next to nothing."""
+    params, key, *rest = SMALL.args()
+    quiet = without_noise(params)
+    path = engine.run(SMALL)(quiet, key, *rest)
+    other = engine.run(SMALL)(quiet, jax.random.fold_in(key, 1), *rest)
+    np.testing.assert_array_equal(path, other)
+    first = path[..., :1, :]  # [N, H + 1, E, P, D]
+    np.testing.assert_array_equal(path, np.broadcast_to(first, path.shape))
+    assert relative_error(path, scan(SMALL)(quiet, key, *rest)) <= engine.rounding
 
 
 def test_keys_decide(engine):

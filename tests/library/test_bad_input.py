@@ -14,6 +14,7 @@ from jaxpets import EnsembleParams, FitConfig, PlanParams, rewards
 from jaxpets.datasets import append, grow, init, obs_variance
 from jaxpets.envs import env_rollout, from_brax
 from jaxpets.envs import half_cheetah as hc
+from jaxpets.models import without_noise
 from jaxpets.optimizers import sharded
 
 ENV = toys.cart_env()
@@ -188,6 +189,11 @@ WRONG = {
         "state must have the structure"),
     "dataset None in fit": (
         lambda: FITTER.step(PARAMS, KEY, FIT, None), "dataset must be a Dataset"),
+    "without_noise of no model": (
+        lambda: without_noise(None), "params must be an EnsembleParams"),
+    "without_noise of a model of another kind": (
+        lambda: without_noise(EnsembleParams((), ())),
+        "params.network must be a NetworkParams"),
     "max_variance": (
         lambda: rewards.max_variance(None), "params must be an EnsembleParams"),
     "epistemic": (

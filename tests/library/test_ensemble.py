@@ -10,6 +10,7 @@ import toys
 import jaxpets
 from jaxpets import EnsembleConfig, Precision
 from jaxpets._src.ensemble_config import layer_decays
+from jaxpets.models import without_noise
 
 E, B, D, A = 3, 7, 2, 1
 
@@ -181,6 +182,22 @@ def test_starts_as_pets_does():
     np.testing.assert_allclose(
         jaxpets.rewards.max_variance(params), np.exp(0.5), rtol=1e-6
     )
+
+
+def test_without_noise_a_model_imagines_the_means_of_its_members(params):
+    model = toys.small_ensemble()
+    obs, action = batch()
+    quiet = without_noise(params)
+    mean, _ = jax.jit(model.predict)(params, obs, action)
+    sample = jax.jit(model.sample)
+    drawn = [sample(quiet, jax.random.key(i), obs, action) for i in range(2)]
+    np.testing.assert_array_equal(*drawn)
+    np.testing.assert_array_equal(drawn[0], mean)
+    assert np.abs(sample(params, jax.random.key(0), obs, action) - mean).max() > 0
+    # What it predicts is the same, with a spread that is next to nothing and no NaN.
+    quiet_mean, quiet_variance = jax.jit(model.predict)(quiet, obs, action)
+    np.testing.assert_array_equal(quiet_mean, mean)
+    assert 0 <= quiet_variance.min() <= quiet_variance.max() < 1e-30
 
 
 @pytest.mark.parametrize("precision", [Precision.TF32, Precision.BF16])

@@ -20,10 +20,12 @@ The numbers. Parameters are packed once per plan, and handed over at every call:
 
 Who includes whom:
 
-    wgmma_rollout.cu    gpu_layout.h, gpu_launch.h, gpu_warp.h, wgmma.h
-    mma_rollout.cu      gpu_layout.h, gpu_launch.h, gpu_warp.h
+    wgmma_rollout.cu    gpu_layout.h, gpu_launch.h, wgmma.h, wgmma_warp.h
+    mma_rollout.cu      gpu_layout.h, gpu_launch.h, gpu_particles.h, mma_product.h
+    wgmma_warp.h        gpu_particles.h: particles whose activations are in registers
+    mma_product.h       gpu_layout.h: what a warp multiplies, and how its weights come
     gpu_launch.h        handler.h: how XLA's call becomes a launch
-    gpu_warp.h          handler.h: what a warp does with its particles
+    gpu_particles.h     handler.h: what a warp or a block does with its particles
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
     handler.h           rollout.h and XLA's c_api.h: the operands as XLA hands them over

@@ -51,6 +51,11 @@ class GpuLayout(abc.ABC):
         """Columns of a hidden layer whose chunks come first, before all others."""
 
     @property
+    @abc.abstractmethod
+    def fragments(self) -> bool:
+        """Whether weights lie as a warp's lanes hold them, or in blocks of 8 x 8."""
+
+    @property
     def head(self) -> int:
         """Columns of the means, and again of the log-variances."""
         return round_up(self.obs_size, 8)
@@ -88,6 +93,7 @@ class GpuLayout(abc.ABC):
             "WIDTH": self.width,
             "LAYERS": len(self.hidden_sizes),
             "LEFT": self.left,
+            "FRAGMENTS": int(self.fragments),
             **self.ring(),
         }
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
@@ -125,12 +131,17 @@ class GpuLayout(abc.ABC):
             rows = self.width if i else self.input_size
             if i == last:
                 entries = np.arange(self.obs_size)
-                columns = np.concatenate([entries, self.head + entries])
+                means, variances = entries, self.head + entries
+                if self.fragments:  # of 8 entries the means, then the log-variances
+                    means = entries // 8 * 16 + entries % 8
+                    variances = means + 8
+                columns = np.concatenate([means, variances])
                 matrices.append(_placed(layer, rows, columns, 2 * self.head))
             else:
                 matrix = _placed(layer, rows, np.arange(outputs), self.width)
                 matrices += [matrix[:, : self.left], matrix[:, self.left :]]
-        return np.concatenate([_blocks(matrix) for matrix in matrices])
+        lay_out = _fragments if self.fragments else _blocks
+        return np.concatenate([lay_out(matrix) for matrix in matrices])
 
 
 def round_up(x: int, multiple: int) -> int:
@@ -177,6 +188,22 @@ def _blocks(matrix: IntArray) -> IntArray:
     height, columns = matrix.shape
     matrix = matrix.reshape(height // DEPTH, 2, 8, columns // 8, 8)
     return matrix.transpose(0, 3, 1, 4, 2).ravel()
+
+
+def _fragments(matrix: IntArray) -> IntArray:
+    """Lays a matrix out as chunks of 16 rows, each as a warp's lanes hold it.
+
+    Order within a chunk: 16 columns, lane, two halves of them, two halves of the rows,
+    two rows. Eight columns that are left over are as 16, but for the halves.
+    """
+    height, columns = matrix.shape
+    count, pairs = height // DEPTH, columns // 16
+    # A lane has a column and every fourth pair of rows.
+    eights = matrix.reshape(count, 2, 4, 2, columns // 8, 8)
+    eights = eights.transpose(0, 4, 5, 2, 1, 3)
+    paired = eights[:, : 2 * pairs].reshape(count, pairs, 2, 32, 4).swapaxes(2, 3)
+    parts = [paired.reshape(count, -1), eights[:, 2 * pairs :].reshape(count, -1)]
+    return np.concatenate(parts, axis=1).ravel()
 
 
 def _half(array: Array) -> Array:

@@ -11,11 +11,6 @@ namespace {
 
 using Half = _Float16;
 
-// Weight (row, column) of a chunk; rows are the inner dimension of the product.
-float weight(const Half* chunk, int row, int column) {
-  return chunk[(column / 8 * 2 + row / 8) * 64 + column % 8 * 8 + row % 8];
-}
-
 std::vector<float> multiply(const std::vector<Half>& inputs, const Half* weights,
                             int columns) {
   std::vector<float> sums(columns, 0.0f);
@@ -23,7 +18,7 @@ std::vector<float> multiply(const std::vector<Half>& inputs, const Half* weights
     for (int column = 0; column < columns; ++column)
       for (int row = 0; row < DEPTH; ++row)
         sums[column] += inputs[first + row] *
-                        weight(weights + first * columns, row, column);
+                        float(weights[first * columns + place(row, column, columns)]);
   return sums;
 }
 
@@ -74,9 +69,10 @@ void run_particle(const Rollout& rollout, int member, int particle) {
     threefry(key[0], key[1], noise_counter(rollout, key, member, particle), 1, bits);
     normal(bits, noise);
     for (int i = 0; i < OBS; ++i)
-      target[i] = head[i] + noise[i] * deviation(head[HEAD + i],
-                                                 rollout.shared[MIN_VARIANCE + i],
-                                                 rollout.shared[MAX_PRECISION + i]);
+      target[i] = head[mean_column(i)] +
+                  noise[i] * deviation(head[variance_column(i)],
+                                       rollout.shared[MIN_VARIANCE + i],
+                                       rollout.shared[MAX_PRECISION + i]);
     move(obs, target, rollout.shared);
     for (int i = 0; i < OBS; ++i) path[(step + 1) * stride + i] = obs[i];
   }

@@ -1,183 +1,229 @@
 // A whole particle rollout in one kernel, for GPUs of compute capability 8.0 and later.
 //
-// A block owns 64 particles of one member for all H steps, 16 of them a warp. Activations
-// stay in registers: the sums of one layer, through swish, are the left operand of the
-// next layer's products. A member's weights stream from L2 through a ring in shared
-// memory, chunk by chunk, every step anew; the warps of a block read each chunk together.
-// The ring is small enough for two blocks on a multiprocessor: while one rounds and
-// squashes, or waits for its warps, the other keeps the tensor cores busy.
+// A block owns up to 80 particles of one member for all H steps. Its four warps share the
+// columns of every layer, not the rows: each warp multiplies all particles by its own
+// weights, which so come from L2 once a step for all and need no shared memory. There lie
+// the activations, as the left operand of the next layer. A layer has two barriers: when
+// all warps have read what it overwrites, and when all have written.
+//
+// A block is small enough for two of them on a multiprocessor of any GPU: while one
+// squashes, draws noise or waits, the other keeps the tensor cores busy.
 //
 // Operands are float16, as for Hopper; sums, the head, the state and its update float32.
 
 #include "gpu_layout.h"
 // The layout comes first.
 #include "gpu_launch.h"
-#include "gpu_warp.h"
+#include "gpu_particles.h"
+#include "mma_product.h"
 
 namespace {
 
-constexpr int WARPS = 4;
+constexpr int ROWS = TILES * TILE;  // particles of a block
 constexpr int THREADS = 32 * WARPS;
-constexpr int TILE = ROWS * WARPS;  // particles of a block
-constexpr int WIDE_CHUNKS = INPUT_CHUNKS + (LAYERS - 1) * HIDDEN_CHUNKS;
-constexpr int HEAD_CHUNKS = HIDDEN_CHUNKS;
-constexpr int SLOT = DEPTH * (WIDTH > 2 * HEAD ? WIDTH : 2 * HEAD);
+constexpr int CHUNKS = INPUT_CHUNKS > HIDDEN_CHUNKS ? INPUT_CHUNKS : HIDDEN_CHUNKS;
+// Of an operand's rows: an odd number of 16 byte words, for 8 rows to be read at once.
+constexpr int STRIDE = CHUNKS * DEPTH + 8;
+// Of a chunk.
+constexpr int WIDE_WEIGHTS = DEPTH * WIDTH, HEAD_WEIGHTS = DEPTH * 2 * HEAD;
 
+using Block = Particles<ROWS, THREADS, STRIDE>;
+// Chunks come from L2 in the time of two or three products; if registers are left for so
+// many. These numbers are of 255.
+constexpr int SUMS = TILES * Hidden::OWN_SUMS + FOURS * Hidden::REST_SUMS;
+constexpr int FITTING = (204 - SUMS - 4 * TILES) / Hidden::WORDS;
+constexpr int BUFFERS = FITTING < 2 ? 2 : FITTING > 4 ? 4 : FITTING;
+using HiddenStream = Stream<Hidden, WIDE_WEIGHTS, BUFFERS>;
+using HeadStream = Stream<Head, HEAD_WEIGHTS, 8>;
+
+// What a block seldom needs lies in shared memory too: registers are for sums.
 struct alignas(16) Shared {
-  __half ring[SLOTS][SLOT];
   float shared[SHARED_NUMBERS];
-  float state[TILE * STATE_STRIDE];
-  float target[TILE * STATE_STRIDE];  // noise, then what the model predicts
-  alignas(16) __half inputs[TILE * INPUT_STRIDE];
-  int path_offset[TILE], action_offset[TILE];  // of each row
+  float state[ROWS * STATE_STRIDE];
+  float target[ROWS * STATE_STRIDE];  // noise, then what the model predicts
+  alignas(16) __half operand[ROWS * STRIDE];  // of the next layer: inputs, activations
+  int path_offset[ROWS], action_offset[ROWS];  // of each row
+  Rollout rollout;
+  int member, first;  // the block's, and its first particle
+  uint32_t key[KEY];  // of the step
 };
 
-// The ring. Chunks are used in the order in which they lie in memory, in every step.
-struct Ring {
-  Shared& smem;
-  const uint16_t* weights;  // of the member
-  const uint16_t* next = weights;
-  int chunk = 0, free = 0, full = 0;  // which is next, and its slot; the slot to be read
-
-  // Starts to copy the next chunk; around the end it is the first of the next step.
-  __device__ __forceinline__ void feed() {
-    const int columns = chunk < WIDE_CHUNKS ? WIDTH : 2 * HEAD;
-    const int words = DEPTH * columns / 8;  // of 16 bytes
-    for (int i = threadIdx.x; i < words; i += THREADS)
-      asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(
-                       address(smem.ring[free] + 8 * i)),
-                   "l"(next + 8 * i)
-                   : "memory");
-    asm volatile("cp.async.commit_group;" ::: "memory");
-    next += DEPTH * columns;
-    if (++chunk == WIDE_CHUNKS + HEAD_CHUNKS) chunk = 0, next = weights;
-    if (++free == SLOTS) free = 0;
-  }
-
-  // Returns the oldest chunk, once it is there; the one before it makes room.
-  __device__ __forceinline__ uint32_t take() {
-    asm volatile("cp.async.wait_group %0;" ::"n"(SLOTS - 2) : "memory");
-    __syncthreads();
-    feed();
-    const uint32_t taken = address(smem.ring[full]);
-    if (++full == SLOTS) full = 0;
-    return taken;
-  }
-};
-
-// Adds 16 rows x 16 deep times 16 deep x 8 columns to the sums of these columns.
-template <int REGISTERS>
-__device__ __forceinline__ void add_product(float (&sums)[REGISTERS], int at,
-                                            const uint32_t* a, uint32_t low,
-                                            uint32_t high) {
-  asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 "
-      "{%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
-      : "+f"(sums[at]), "+f"(sums[at + 1]), "+f"(sums[at + 2]), "+f"(sums[at + 3])
-      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(low), "r"(high));
+// The compiler then knows nothing of a number. What follows from it is computed where it
+// is needed; kept from step to step, it would take the registers of sums.
+__device__ __forceinline__ void forget(int& number) {
+  asm volatile("" : "+r"(number));
 }
 
-// sums = activations x weights: the next CHUNKS of the ring.
-template <int CHUNKS, int COLUMNS, int REGISTERS>
-__device__ __forceinline__ void multiply(float (&sums)[COLUMNS / 2],
-                                         const uint32_t (&activations)[REGISTERS],
-                                         Ring& ring, int lane) {
+// Behind an operand's last column stand two ones, for the rows that hold the biases.
+template <int COLUMN>
+__device__ __forceinline__ void append_ones(__half* operand, int thread) {
+  constexpr int COUNT = DEPTH * ((COLUMN + 2 + DEPTH - 1) / DEPTH) - COLUMN;
+  for (int i = thread; i < ROWS * COUNT; i += THREADS)
+    operand[i / COUNT * STRIDE + COLUMN + i % COUNT] =
+        __half(i % COUNT < 2 ? 1.0f : 0.0f);
+}
+
+// A warp's activations of a layer, rounded: two to a word, in the order of the sums.
+struct Activations {
+  static constexpr int OWN = Hidden::OWN_SUMS / 2, REST = Hidden::REST_SUMS / 2;
+  uint32_t own[TILES][OWN > 0 ? OWN : 1], rest[FOURS][REST > 0 ? REST : 1];
+
+  template <int COUNT>
+  static __device__ __forceinline__ void round(uint32_t* rounded, float* sums) {
 #pragma unroll
-  for (int i = 0; i < COLUMNS / 2; ++i) sums[i] = 0.0f;
-#pragma unroll
-  for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-    const uint32_t weights = ring.take() + 16 * lane;  // a row of 8 for every lane
-    const uint32_t* a = activations + 4 * chunk;
-#pragma unroll
-    for (int block = 0; block < COLUMNS / 8; block += 2) {
-      uint32_t w[4];
-      if (block + 1 < COLUMNS / 8) {
-        asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
-                     : "=r"(w[0]), "=r"(w[1]), "=r"(w[2]), "=r"(w[3])
-                     : "r"(weights + 256 * block)
-                     : "memory");
-        add_product(sums, 4 * block, a, w[0], w[1]);
-        add_product(sums, 4 * block + 4, a, w[2], w[3]);
-      } else {
-        asm volatile("ldmatrix.sync.aligned.m8n8.x2.shared.b16 {%0, %1}, [%2];"
-                     : "=r"(w[0]), "=r"(w[1])
-                     : "r"(weights + 256 * block)
-                     : "memory");
-        add_product(sums, 4 * block, a, w[0], w[1]);
-      }
+    for (int i = 0; i < COUNT; ++i) {
+      float (&two)[2] = *reinterpret_cast<float (*)[2]>(sums + 2 * i);
+      swish(two);
+      rounded[i] = pack(two[0], two[1]);
     }
   }
+
+  template <int COUNT>
+  static __device__ __forceinline__ void store(__half* to, const uint32_t* rounded) {
+#pragma unroll
+    for (int i = 0; i < COUNT; ++i)
+      *reinterpret_cast<uint32_t*>(to + i / 2 * 8 + i % 2 * 8 * STRIDE) = rounded[i];
+  }
+
+  __device__ __forceinline__ void compute(Sums<Hidden>& sums) {
+#pragma unroll
+    for (int tile = 0; tile < TILES; ++tile) round<OWN>(own[tile], sums.own[tile]);
+#pragma unroll
+    for (int four = 0; four < FOURS; ++four) round<REST>(rest[four], sums.rest[four]);
+  }
+
+  __device__ __forceinline__ void write(__half* operand, int warp, int lane) const {
+    __half* const place = operand + lane / 4 * STRIDE + 2 * (lane % 4);
+#pragma unroll
+    for (int tile = 0; tile < TILES; ++tile)
+      store<OWN>(
+          place + tile_of(tile, warp) * TILE * STRIDE + warp * 16 * Hidden::PAIRS,
+          own[tile]);
+#pragma unroll
+    for (int four = 0; four < FOURS; ++four)
+      if (REST > 0 && warp < tiles_of(four))
+        store<REST>(place + tile_of(four * WARPS, warp) * TILE * STRIDE +
+                        WARPS * 16 * Hidden::PAIRS,
+                    rest[four]);
+  }
+};
+
+// A lane's addresses in each tile of the operand.
+__device__ __forceinline__ void find_rows(uint32_t (&rows)[TILES], const __half* operand,
+                                          int warp, int lane) {
+#pragma unroll
+  for (int tile = 0; tile < TILES; ++tile)
+    rows[tile] = address(operand + (tile_of(tile, warp) * TILE + lane % 16) * STRIDE +
+                         lane / 16 * 8);
 }
 
-template <int CHUNKS, int REGISTERS>
-__device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
-                                             const uint32_t (&operand)[REGISTERS],
-                                             Ring& ring, int lane) {
-  float sums[WIDTH / 2];
-  multiply<CHUNKS, WIDTH>(sums, operand, ring, lane);
-  swish(sums);
-  // Sums lie in registers as activations do.
-#pragma unroll
-  for (int i = 0; i < WIDTH / 4; ++i)
-    activations[i] = pack(sums[2 * i], sums[2 * i + 1]);
-  append_ones(activations, lane % 4);
+// One hidden layer, and the way of the next one's weights.
+__device__ __forceinline__ void hidden_layer(HiddenStream& stream, int chunks,
+                                             const uint16_t* next, int next_chunks,
+                                             __half* operand, int thread) {
+  const int warp = thread / 32, lane = thread % 32, pair = warp * Hidden::PAIRS;
+  uint32_t rows[TILES];
+  find_rows(rows, operand, warp, lane);
+  __syncthreads();  // the operand is written
+  Sums<Hidden> sums;
+  multiply(sums, rows, stream, chunks, lane);
+  Activations activations;
+  activations.compute(sums);
+  // Now, when there are registers, and before there is much to wait for.
+  stream.start(next, next_chunks, pair, lane);
+  __syncthreads();  // all have read the operand
+  activations.write(operand, warp, lane);
+}
+
+__device__ __forceinline__ Block particles(Shared& smem, int thread) {
+  const Rollout& rollout = smem.rollout;
+  const int step_stride = rollout.num_members * rollout.particles * OBS;
+  return {rollout,          smem.shared,        smem.operand, smem.state, smem.target,
+          smem.path_offset, smem.action_offset, thread,       step_stride};
 }
 
 __host__ __device__ __forceinline__ int blocks_of_member(const Rollout& rollout) {
-  return (rollout.num_candidates * rollout.particles + TILE - 1) / TILE;
+  return (rollout.num_candidates * rollout.particles + ROWS - 1) / ROWS;
 }
 
 __global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
     const __grid_constant__ Rollout whole) {
   extern __shared__ __align__(16) uint8_t bytes[];
   Shared& smem = *reinterpret_cast<Shared*>(bytes);
-  const int blocks = blocks_of_member(whole), of_batch = blocks * whole.num_members;
-  const Rollout rollout = at_batch(whole, blockIdx.x / of_batch);
-  const int member = blockIdx.x % of_batch / blocks;
-  const int lane = threadIdx.x % 32, own = threadIdx.x / 32 * ROWS;
-  const int first = blockIdx.x % blocks * TILE + own;
-  Ring ring = {smem, rollout.weights + int64_t(member) * MEMBER_WEIGHTS};
-  for (int slot = 0; slot < SLOTS - 1; ++slot) ring.feed();
-  for (int i = threadIdx.x; i < SHARED_NUMBERS; i += THREADS)
-    smem.shared[i] = rollout.shared[i];
+  const Rollout& rollout = smem.rollout;
+  int thread = threadIdx.x;
+  if (thread == 0) {
+    const int blocks = blocks_of_member(whole), of_batch = blocks * whole.num_members;
+    smem.rollout = at_batch(whole, blockIdx.x / of_batch);
+    smem.member = blockIdx.x % of_batch / blocks;
+    smem.first = blockIdx.x % blocks * ROWS;
+  }
   __syncthreads();
-  Warp warp = {rollout,
-               smem.shared,
-               smem.inputs + own * INPUT_STRIDE,
-               smem.state + own * STATE_STRIDE,
-               smem.target + own * STATE_STRIDE,
-               smem.path_offset + own,
-               smem.action_offset + own,
-               lane,
-               rollout.num_members * rollout.particles * OBS};
-  warp.begin(member, first);
+  for (int i = thread; i < SHARED_NUMBERS; i += THREADS)
+    smem.shared[i] = rollout.shared[i];
+  if (thread < KEY) smem.key[thread] = rollout.keys[thread];
+  __syncthreads();
+  particles(smem, thread).begin(smem.member, smem.first);
+  append_ones<INPUTS>(smem.operand, thread);
 
-  // A lane draws as many numbers at once as it takes to need few rounds.
-  constexpr int DRAWS = (ROWS * OBS + 31) / 32, ROUNDS = (DRAWS + 5) / 6;
+  const uint16_t* const weights = rollout.weights + int64_t(smem.member) * MEMBER_WEIGHTS;
+  HiddenStream stream;
+  stream.start(weights, INPUT_CHUNKS, thread / 32 * Hidden::PAIRS, thread % 32);
+  // A thread draws as many numbers at once as it takes to need few rounds.
+  constexpr int DRAWS = (ROWS * OBS + THREADS - 1) / THREADS, ROUNDS = (DRAWS + 5) / 6;
   constexpr int AT_ONCE = (DRAWS + ROUNDS - 1) / ROUNDS;
   for (int step = 0; step < rollout.horizon; ++step) {
-    __syncwarp();
-    warp.load_actions(min(step + 1, rollout.horizon - 1));
-    uint32_t activations[4 * HIDDEN_CHUNKS];
-    {
-      uint32_t operand[4 * INPUT_CHUNKS];
-      warp.read_inputs(operand);
-      hidden_layer<INPUT_CHUNKS>(activations, operand, ring, lane);
-    }
+    forget(thread);
+    __syncthreads();
+    particles(smem, thread).store_states(step);
+    hidden_layer(stream, INPUT_CHUNKS, weights + (LAYERS > 1 ? INPUT_WEIGHTS : 0),
+                 LAYERS > 1 ? HIDDEN_CHUNKS : INPUT_CHUNKS, smem.operand, thread);
+    append_ones<WIDTH>(smem.operand, thread);
 #pragma unroll 1
-    for (int layer = 1; layer < LAYERS; ++layer)
-      hidden_layer<HIDDEN_CHUNKS>(activations, activations, ring, lane);
-    const uint32_t* key = rollout.keys + KEY * step;
-    draw_noise<ROWS * OBS, 32, AT_ONCE>(
-        warp.targets, key, noise_counter(rollout, key, member, first), lane);
-    float head[HEAD];
-    multiply<HEAD_CHUNKS, 2 * HEAD>(head, activations, ring, lane);
-    warp.write_actions();
-    warp.store_states(step);
-    warp.move_all(head);
+    for (int layer = 1; layer < LAYERS; ++layer) {
+      forget(thread);
+      const bool is_last = layer + 1 == LAYERS;
+      hidden_layer(stream, HIDDEN_CHUNKS,
+                   weights + (is_last ? 0 : INPUT_WEIGHTS + layer * HIDDEN_WEIGHTS),
+                   is_last ? INPUT_CHUNKS : HIDDEN_CHUNKS, smem.operand, thread);
+    }
+    forget(thread);
+    const int warp = thread / 32, lane = thread % 32;
+    int pair = warp;  // of columns: means, and the log-variances of the same entries
+    const uint16_t* const head_weights =
+        weights + INPUT_WEIGHTS + (LAYERS - 1) * HIDDEN_WEIGHTS;
+    HeadStream head;
+    head.start(head_weights, HIDDEN_CHUNKS, min(pair, HEAD / 8 - 1), lane);
+    Block block = particles(smem, thread);
+    // What the next step needs is read now, for it comes from far.
+    const int next = min(step + 1, rollout.horizon - 1);
+    block.load_actions(next);
+    const uint32_t next_key = rollout.keys[KEY * next + thread % KEY];
+    draw_noise<ROWS * OBS, THREADS, AT_ONCE>(
+        smem.target, smem.key,
+        noise_counter(rollout, smem.key, smem.member, smem.first), thread);
+    __syncthreads();
+    uint32_t rows[TILES];
+    while (pair < HEAD / 8) {
+      find_rows(rows, smem.operand, warp, lane);
+      Sums<Head> drawn;
+      multiply(drawn, rows, head, HIDDEN_CHUNKS, lane);
+#pragma unroll
+      for (int tile = 0; tile < TILES; ++tile)
+        draw_targets(smem.target + 8 * pair +
+                         (tile_of(tile, warp) * TILE + lane / 4) * STATE_STRIDE,
+                     drawn.own[tile], smem.shared + 8 * pair, lane % 4, OBS - 8 * pair);
+      pair += WARPS;
+      if (pair < HEAD / 8) head.start(head_weights, HIDDEN_CHUNKS, pair, lane);
+    }
+    __syncthreads();
+    block.move_all();
+    block.write_actions();
+    smem.key[thread % KEY] = next_key;
+    append_ones<INPUTS>(smem.operand, thread);
   }
-  __syncwarp();
-  warp.store_states(rollout.horizon);
-  asm volatile("cp.async.wait_all;" ::: "memory");
+  __syncthreads();
+  particles(smem, thread).store_states(rollout.horizon);
 }
 
 XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {

@@ -31,6 +31,11 @@ class WgmmaLayout(GpuLayout):
         """Columns of the left half, the larger one; both have some."""
         return round_up(round_up(self.width, 16) // 2, 16)
 
+    @property
+    def fragments(self) -> bool:
+        """No: the tensor cores read weights in shared memory."""
+        return False
+
     def misfit(self) -> str | None:
         """Returns whether too much of the model would have to stream."""
         if self.streaming() is None:

@@ -15,8 +15,8 @@
 #include "gpu_layout.h"
 // The layout comes first.
 #include "gpu_launch.h"
-#include "gpu_warp.h"
 #include "wgmma.h"
+#include "wgmma_warp.h"
 
 namespace {
 
@@ -365,7 +365,7 @@ __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block
       finish<0>(head);
     }
     wait(&smem.noise_full[consumer], step & 1);
-    warp.move_all(head);
+    warp.move_by(head);
     sync_warpgroup(consumer);
     if (thread == 0) arrive(&smem.noise_empty[consumer]);
   }

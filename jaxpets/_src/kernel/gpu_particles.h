@@ -1,5 +1,5 @@
-// What a warp does with its 16 particles in every step, but for the products of layers:
-// inputs, activations, noise and moves. For Hopper's kernel and the one of older GPUs.
+// What threads do with their particles in every step, but for the products of layers:
+// inputs, activations, noise and moves. For Hopper's kernel and the one of other GPUs.
 #pragma once
 
 #include <cuda_fp16.h>
@@ -8,10 +8,8 @@
 
 namespace {
 
-constexpr int ROWS = 16;
 // An odd number of 16 byte words: a thread a row, four numbers at once, and no conflicts.
 constexpr int STATE_STRIDE = 4 * (round_up(OBS, 4) / 4 | 1);
-constexpr int INPUT_STRIDE = INPUT_CHUNKS * DEPTH + 8;
 
 __device__ __forceinline__ uint32_t address(const void* pointer) {
   return static_cast<uint32_t>(__cvta_generic_to_shared(pointer));
@@ -31,14 +29,6 @@ __device__ __forceinline__ void swish(float (&sums)[REGISTERS]) {
     asm("tanh.approx.f32 %0, %1;" : "=f"(tanh) : "f"(sums[i]));
     sums[i] = fmaf(sums[i], tanh, sums[i]);
   }
-}
-
-// Behind the last activation stand two ones, for the rows that hold the biases.
-__device__ __forceinline__ void append_ones(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
-                                            int pair) {
-#pragma unroll
-  for (int i = WIDTH / 4; i < 4 * HIDDEN_CHUNKS; ++i)
-    activations[i] = i < WIDTH / 4 + 2 && pair == 0 ? pack(1.0f, 1.0f) : 0;
 }
 
 // Writes the features of one particle into the input tile.
@@ -89,21 +79,23 @@ __device__ __forceinline__ void store(float* to, const float* from, bool wanted)
 }
 
 // Turns means and raw log-variances into draws; the noise stands where they go. Mean and
-// log-variance of one entry lie in the same thread, entries two by two.
-__device__ __forceinline__ void draw_targets(float* target, const float (&head)[HEAD],
-                                             const float* shared, int pair) {
+// log-variance of one entry lie in the same thread, entries two by two. There are
+// `entries` in all.
+template <int COLUMNS>
+__device__ __forceinline__ void draw_targets(float* target, const float (&head)[COLUMNS],
+                                             const float* shared, int pair, int entries) {
 #pragma unroll
-  for (int i = 0; i < HEAD / 2; i += 2) {
+  for (int i = 0; i < COLUMNS / 2; i += 2) {
     // Wait for no branch: what stands behind the last entry is computed, not stored.
     const int column = i / 4 * 8 + 2 * pair;
-    const int at = i / 4 * 8 + 6 < OBS ? column : min(column, (OBS - 1) / 2 * 2);
+    const int at = i / 4 * 8 + 6 < entries ? column : min(column, (entries - 1) / 2 * 2);
     float2* const place =
         reinterpret_cast<float2*>(target + i % 4 / 2 * 8 * STATE_STRIDE + at);
     const float2 low = *reinterpret_cast<const float2*>(shared + MIN_VARIANCE + at);
     const float2 high = *reinterpret_cast<const float2*>(shared + MAX_PRECISION + at);
     float2 value = *place;
-    value.x = head[i] + value.x * deviation(head[HEAD / 2 + i], low.x, high.x);
-    value.y = head[i + 1] + value.y * deviation(head[HEAD / 2 + i + 1], low.y, high.y);
+    value.x = head[i] + value.x * deviation(head[COLUMNS / 2 + i], low.x, high.x);
+    value.y = head[i + 1] + value.y * deviation(head[COLUMNS / 2 + i + 1], low.y, high.y);
     if (column == at) *place = value;
   }
 }
@@ -132,24 +124,33 @@ __device__ __forceinline__ void draw_noise(float* rows, const uint32_t* key,
   }
 }
 
-// The particles of a warp, which has them from beginning to end. The pointers are to its
-// own rows in shared memory.
-struct Warp {
-  static constexpr int ACTIONS = (ROWS * ACTION + 31) / 32;  // of a lane
-  static constexpr int VECTORS = (ROWS * OBS / VECTOR + 31) / 32;
+// ROWS particles of THREADS threads, a warp or a block, which have them from beginning to
+// end. The pointers are to their own rows in shared memory.
+template <int ROWS, int THREADS, int INPUT_STRIDE>
+struct Particles {
+  static_assert(ROWS <= THREADS, "a thread moves one particle");
+  static constexpr int ACTIONS = (ROWS * ACTION + THREADS - 1) / THREADS;  // of a thread
+  static constexpr int VECTORS = (ROWS * OBS / VECTOR + THREADS - 1) / THREADS;
 
   const Rollout& rollout;
   const float* shared;
   __half* inputs;
   float *states, *targets;
   int *path_offsets, *action_offsets;  // of each row
-  int lane, step_stride;
+  int thread, step_stride;
   float action[ACTIONS];
+
+  __device__ __forceinline__ void sync() const {
+    if constexpr (THREADS == 32)
+      __syncwarp();
+    else
+      __syncthreads();
+  }
 
   __device__ __forceinline__ void load_actions(int step) {
 #pragma unroll
     for (int k = 0; k < ACTIONS; ++k) {
-      const int i = min(lane + 32 * k, ROWS * ACTION - 1);
+      const int i = min(thread + THREADS * k, ROWS * ACTION - 1);
       action[k] =
           rollout.actions[action_offsets[i / ACTION] + step * ACTION + i % ACTION];
     }
@@ -158,7 +159,7 @@ struct Warp {
   __device__ __forceinline__ void write_actions() {
 #pragma unroll
     for (int k = 0; k < ACTIONS; ++k) {
-      const int i = min(lane + 32 * k, ROWS * ACTION - 1);
+      const int i = min(thread + THREADS * k, ROWS * ACTION - 1);
       const int column = FEATURES + i % ACTION;
       inputs[i / ACTION * INPUT_STRIDE + column] =
           __float2half_rn(scaled(action[k], column, shared));
@@ -168,69 +169,51 @@ struct Warp {
   __device__ __forceinline__ void store_states(int step) {
 #pragma unroll
     for (int k = 0; k < VECTORS; ++k) {
-      const int i = min(lane + 32 * k, ROWS * OBS / VECTOR - 1) * VECTOR;
+      const int i = min(thread + THREADS * k, ROWS * OBS / VECTOR - 1) * VECTOR;
       const int in_row = i % OBS, offset = path_offsets[i / OBS];
       store(rollout.path + offset + step * step_stride + in_row,
             states + i / OBS * STATE_STRIDE + in_row, offset >= 0);
     }
   }
 
-  // Puts the particles from `first` on where they start, with their first inputs.
+  // Puts the particles from `first` on where they start, with their first inputs. What
+  // stands behind these is the caller's.
   __device__ __forceinline__ void begin(int member, int first) {
-    for (int i = lane; i < ROWS * INPUT_STRIDE; i += 32) {
-      const int column = i % INPUT_STRIDE;
-      inputs[i] = column == INPUTS || column == INPUTS + 1 ? __half(1.0f) : __half(0.0f);
-    }
-    if (lane < ROWS) {
+    if (thread < ROWS) {
       const int rows = rollout.num_candidates * rollout.particles;
-      const int wanted = first + lane;
+      const int wanted = first + thread;
       const int particle = min(wanted, rows - 1);
       const int candidate = particle / rollout.particles;
       const int in_step = (member * rollout.particles + particle % rollout.particles) * OBS;
-      path_offsets[lane] =
+      path_offsets[thread] =
           wanted < rows ? candidate * (rollout.horizon + 1) * step_stride + in_step : -1;
-      action_offsets[lane] = candidate * rollout.horizon * ACTION;
+      action_offsets[thread] = candidate * rollout.horizon * ACTION;
     }
-    __syncwarp();
-    if (lane < ROWS) {
+    sync();
+    if (thread < ROWS) {
       float obs[OBS];
 #pragma unroll
       for (int i = 0; i < OBS; ++i)
-        states[lane * STATE_STRIDE + i] = obs[i] = rollout.obs[i];
-      write_features(inputs + lane * INPUT_STRIDE, obs, shared);
+        states[thread * STATE_STRIDE + i] = obs[i] = rollout.obs[i];
+      write_features(inputs + thread * INPUT_STRIDE, obs, shared);
     }
     load_actions(0);
     write_actions();
   }
 
-  // Reads the inputs as the left operand of the first layer.
-  __device__ __forceinline__ void read_inputs(uint32_t (&operand)[4 * INPUT_CHUNKS]) {
-    const __half* from = inputs + lane / 4 * INPUT_STRIDE + 2 * (lane % 4);
-#pragma unroll
-    for (int chunk = 0; chunk < INPUT_CHUNKS; ++chunk) {
-#pragma unroll
-      for (int i = 0; i < 4; ++i)  // rows +0 and +8, then both 8 columns on
-        operand[4 * chunk + i] = *reinterpret_cast<const uint32_t*>(
-            from + i % 2 * 8 * INPUT_STRIDE + i / 2 * 8 + chunk * DEPTH);
-    }
-    __syncwarp();
-  }
-
-  // Moves the particles to what was drawn of the head, where the noise stands.
-  __device__ __forceinline__ void move_all(const float (&head)[HEAD]) {
-    draw_targets(targets + lane / 4 * STATE_STRIDE, head, shared, lane % 4);
-    __syncwarp();
-    if (lane < ROWS) {
+  // Moves the particles to their targets.
+  __device__ __forceinline__ void move_all() {
+    if (thread < ROWS) {
       float obs[OBS], drawn[OBS];
 #pragma unroll
       for (int i = 0; i < OBS; ++i) {
-        obs[i] = states[lane * STATE_STRIDE + i];
-        drawn[i] = targets[lane * STATE_STRIDE + i];
+        obs[i] = states[thread * STATE_STRIDE + i];
+        drawn[i] = targets[thread * STATE_STRIDE + i];
       }
       move(obs, drawn, shared);
 #pragma unroll
-      for (int i = 0; i < OBS; ++i) states[lane * STATE_STRIDE + i] = obs[i];
-      write_features(inputs + lane * INPUT_STRIDE, obs, shared);
+      for (int i = 0; i < OBS; ++i) states[thread * STATE_STRIDE + i] = obs[i];
+      write_features(inputs + thread * INPUT_STRIDE, obs, shared);
     }
   }
 };

@@ -1,0 +1,97 @@
+"""Today's rows beside the committed ones, both in units of the plain XLA program.
+
+Machines of one kind differ by some per cent, and so do days. What is compared is how
+often a program runs while the plan by the scan, in bf16 and of one seed, runs once in
+the same process; of both the fastest run, since a call that is waited for wakes late
+on some days.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks import workloads
+
+RESULTS = Path(__file__).parent / "results"
+SLOWER = 0.9  # of the committed speed: no longer chance
+_UNIT = {
+    "num_samples": workloads.named_size("paper").num_samples,
+    "engine": "scan",
+    "precision": "bf16",
+    "seeds": 1,
+    "plans": 1,
+}
+Row = dict[str, Any]
+
+
+class Pair(NamedTuple):
+    """A row of today, and the last committed one of the same program and sizes."""
+
+    row: Row
+    committed: Row | None
+    speed: float | None  # over the committed one, both in units of the plain program
+
+
+def pairs(today: Sequence[Row], committed: Iterable[Row]) -> Iterator[Pair]:
+    """Yields a pair per row of today that has a time; rows of other devices are new."""
+    before = {
+        _key(row): (row, unit)
+        for row, unit in _with_unit(committed)
+        if row["device"] == today[0]["device"]
+    }
+    for row, unit in _with_unit(today):
+        then, unit_then = before.get(_key(row), (None, None))
+        speed = None
+        if then and unit and unit_then:
+            speed = unit / row["min_ms"] / (unit_then / then["min_ms"])
+        yield Pair(row, then, speed)
+
+
+def report(today: Sequence[Row], folder: Path = RESULTS) -> list[Row]:
+    """Prints today's rows beside those in a folder, then the plans of other systems.
+
+    Returns:
+      The rows that are slower than a tenth less than what is committed.
+    """
+    lines = [
+        json.loads(line)
+        for path in sorted(folder.glob("*.jsonl"))
+        for line in path.read_text().splitlines()
+    ]
+    found = list(pairs(today, lines))
+    print(f"{'median ms':>10}  {'committed':>10}  {'speed':>6}")
+    for row, then, speed in found:
+        cells = [f"{row['median_ms']:>10.4g}"]
+        cells.append(f"{then['median_ms']:>10.4g}" if then else f"{'-':>10}")
+        cells.append(f"{speed:>6.2f}" if speed else f"{'-':>6}")
+        print(*cells, row["benchmark"], _text(row), sep="  ")
+    device = today[0]["device"]
+    for row in lines:
+        if "source" in row and row["device"] == device:
+            print(f"{row['ms_per_plan']:>10.4g}  {row['name']}, {row['engine']}, "
+                  f"{row['dtype']}, {row['seeds']} seeds: {row['source']}")  # fmt: skip
+    return [pair.row for pair in found if pair.speed and pair.speed < SLOWER]
+
+
+def _with_unit(rows: Iterable[Row]) -> Iterator[tuple[Row, float | None]]:
+    """Yields each row that has a time with the last time of the plain program."""
+    unit = None
+    for row in rows:
+        if "min_ms" in row:
+            if row["benchmark"] == "plan" and _UNIT.items() <= row["sizes"].items():
+                unit = row["min_ms"]
+            yield row, unit
+
+
+def _key(row: Row) -> str:
+    return json.dumps([row["benchmark"], row["sizes"]], sort_keys=True)
+
+
+def _text(row: Row) -> str:
+    """Returns the sizes that are numbers or words."""
+    return " ".join(
+        f"{name}={value}"
+        for name, value in row["sizes"].items()
+        if isinstance(value, int | str)
+    )

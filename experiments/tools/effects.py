@@ -1,0 +1,209 @@
+"""`python -m experiments.tools.effects RUNS`: what arms, refit and search each bring.
+
+Reads the zero-shot logs of a study, whose variants are its tags, and prints tables in
+Markdown. A score is a return over that of the simulator as the model, which
+`experiments.tools.simulator --json` has measured. Beside it: what share of the steps
+was upright, and of the reward that was planned, what came.
+"""
+
+import argparse
+import itertools
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from .. import calling, signals
+from ..errors import RunError, UsageError, last_line, storage_errors
+from ..report import logs, stats, tables
+from ..report.logs import Scores
+from ..storage import rundir
+from ..storage.metrics import Row, number
+from . import suite
+
+UPRIGHT = "upright"  # a task that measures
+Results = dict[str, dict[str, dict[str, dict[str, Any]]]]  # variant, arm, task
+Ceilings = dict[str, float]  # of a step, by task
+
+
+class _Trial(msgspec.Struct):
+    """What is read of a trial of the simulator."""
+
+    task: str
+    steps: Annotated[int, msgspec.Meta(gt=0)]
+    reward: float = msgspec.field(name="return")
+
+
+_TRIAL = msgspec.json.Decoder(_Trial)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Writes the results, and prints the tables; returns an exit code."""
+    parser = argparse.ArgumentParser(
+        prog=calling.usage("tools.effects"), description=__doc__
+    )
+    parser.add_argument("runs", type=Path, help="a folder with runs below it")
+    parser.add_argument("--ceilings", type=Path, required=True, help="the simulator's")
+    parser.add_argument("--explored", type=int, default=60, help="exploration trials")
+    parser.add_argument("--json", type=Path, help="file for the results")
+    args = parser.parse_args(argv)
+    try:
+        rows = [row for row in logs.load(args.runs) if row.explored == args.explored]
+        found = results(rows, ceilings(args.ceilings))
+        if args.json is not None:
+            with storage_errors(f"write {args.json}"):
+                rundir.write_json(args.json, found)
+    except RunError as error:
+        signals.say(last_line(error))
+        return error.exit_code
+    print("\n".join(report(found)))
+    return 0
+
+
+def ceilings(path: Path) -> Ceilings:
+    """Returns the simulator's mean reward of a step, by task.
+
+    Raises:
+      RunError: if the file cannot be read.
+    """
+    found: dict[str, list[float]] = {}
+    try:
+        lines = path.read_bytes().splitlines()
+        for trial in map(_TRIAL.decode, lines):
+            found.setdefault(trial.task, []).append(trial.reward / trial.steps)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise UsageError(f"{path} has no trials of the simulator: {error}") from error
+    return {task: float(np.mean(rewards)) for task, rewards in found.items()}
+
+
+def results(rows: Iterable[Row], ceiling: Ceilings) -> Results:
+    """Returns numbers by variant, arm and task; `score` is a share of the ceiling.
+
+    Raises:
+      UsageError: if nothing has performed, or a task has no ceiling above zero.
+    """
+    performed = [row for row in rows if row.phase == "zero-shot"]
+    if not performed:
+        raise UsageError("no run has performed after so many trials of exploration.")
+    found: Results = {}
+    for tag in sorted({row.tag for row in performed}):
+        own = [row for row in performed if row.tag == tag]
+        for arm, by_task in logs.scores(own, own[0].explored).items():
+            of_arm = [row for row in own if row.arm == arm]
+            config = logs.config(of_arm[0].run)
+            explored = own[0].explored * int(config["trial_length"])
+            for task, scores in by_task.items():
+                if not ceiling.get(task, 0.0) > 0.0:
+                    raise UsageError(f"the simulator has earned nothing for {task}.")
+                length = int(config["task_length"])
+                seen = [row for row in of_arm if row.task == task]
+                found.setdefault(tag, {}).setdefault(arm, {})[task] = {
+                    **suite.numbers(scores, explored),
+                    **_beside(seen, length),
+                    "score": {
+                        str(seed): round(score / length / ceiling[task], 4)
+                        for seed, score in scores.items()
+                    },
+                }
+    return found
+
+
+def report(found: Results) -> list[str]:
+    """Returns the tables: all tasks in one score, what each part brings, each task."""
+    lines: list[str] = []
+    for tag, by_arm in found.items():
+        arms = tables.in_order(by_arm)
+        lines += [f"## {tag or 'as the runs are set'}", ""]
+        lines += tables.table(
+            ["arm", "the paper's tasks", "tasks held out", "upright", "came / planned"],
+            [[f"`{arm}`", *_summary(by_arm[arm])] for arm in arms],
+        )
+        every = dict.fromkeys(task for x in by_arm.values() for task in x)
+        names = tables.tasks_in_order(every)
+        lines += tables.table(
+            ["task, return", *(f"`{arm}`" for arm in arms)],
+            [
+                [task, *(suite.cell(by_arm[arm].get(task)) for arm in arms)]
+                for task in names
+            ],
+        )
+    return [*lines, "## one variant less another", "", *_effects(found)]
+
+
+def _beside(rows: Sequence[Row], length: int) -> dict[str, Any]:
+    """Returns the share of upright steps, and of what was planned the share that came.
+
+    Of all trials together: a trial that plans nothing has no share of its own.
+    """
+    planned = sum(number(row.data["value"]) * length for row in rows)
+    came = sum(number(row.data["return"]) for row in rows)
+    measures = {"kept": round(came / planned, 3) if planned > 0 else None}
+    if all(UPRIGHT in row.data["returns"] for row in rows):
+        upright = [number(row.data["returns"][UPRIGHT]) / length for row in rows]
+        measures[UPRIGHT] = round(float(np.mean(upright)), 3)
+    return measures
+
+
+def _summary(by_task: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Returns the cells of an arm; `upright` is no task here."""
+    tasks = {name: x for name, x in by_task.items() if name != UPRIGHT}
+    papers = [x for name, x in tasks.items() if name in tables.TASKS]
+    others = [x for name, x in tasks.items() if name not in tables.TASKS]
+    shares = [_mean(x.get(measure) for x in tasks.values()) for measure in _BESIDE]
+    return [_iqm(papers), _iqm(others), *shares]
+
+
+_BESIDE = (UPRIGHT, "kept")
+
+
+def _mean(values: Iterable[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{np.mean(known):.2f}" if known else "-"
+
+
+def _iqm(of_tasks: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the interquartile mean of the scores of tasks that have equal seeds."""
+    if not of_tasks:
+        return "-"
+    scores = _scores(of_tasks)
+    low, high = stats.stratified_interval(scores)
+    return f"{float(stats.iqm(scores.reshape(-1))):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _scores(of_tasks: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """Returns scores `[K, S]` of the seeds that performed all K tasks."""
+    seeds = sorted(set.intersection(*(set(x["score"]) for x in of_tasks)), key=int)
+    return np.array([[x["score"][seed] for seed in seeds] for x in of_tasks])
+
+
+def _effects(found: Results) -> list[str]:
+    """Returns differences of a seed's mean score over tasks between two variants."""
+    scores: Scores = {}
+    for tag, by_arm in found.items():
+        for arm, by_task in by_arm.items():
+            tasks = [x for name, x in by_task.items() if name != UPRIGHT]
+            of_seeds = 100.0 * _scores(tasks).mean(axis=0)
+            scores.setdefault(f"{arm}, {tag}", {})["score, %"] = dict(
+                enumerate(of_seeds.tolist())
+            )
+    arms = tables.in_order({arm for by_arm in found.values() for arm in by_arm})
+    pairs = [
+        (f"{arm}, {one}", f"{arm}, {other}")
+        for arm in arms
+        for other, one in itertools.combinations(found, 2)
+        if _one_apart(one, other) and arm in found[one] and arm in found[other]
+    ]
+    return tables.differences(["score, %"], scores, pairs)
+
+
+def _one_apart(one: str, other: str) -> bool:
+    """Returns whether one word of a variant's was added to the other's, or changed."""
+    ours, theirs = set(one.split("-")), set(other.split("-"))
+    return max(len(ours - theirs), len(theirs - ours)) == 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+"""Arms and variants of a study: one score, what is beside it, what each part brings."""
+
+import json
+import runpy
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_logs import write_run
+
+from experiments.report import stats
+from experiments.tools import effects
+from jaxpets.envs import half_cheetah as cheetah
+
+LENGTH = 20
+TASKS = Path(effects.__file__).parents[1] / "sweeps/half_cheetah_tasks.py"
+
+
+def performed(folder, arm, tag, returns, upright=10.0):
+    """A run whose seeds 0, 1, ... returned these, by task; it planned twice as much."""
+    rows = [
+        {"phase": "zero-shot", "arm": arm, "explored_trials": 60, "seed": seed,
+         "task": task, "trial": 1, "return": value, "value": 2 * value / LENGTH,
+         "returns": {task: value, "upright": upright}}
+        for task, values in returns.items()
+        for seed, value in enumerate(values)
+    ]  # fmt: skip
+    config = {"phase": "zero-shot", "arm": arm, "task_length": LENGTH}
+    write_run(folder / arm / f"zero-shot-060-{tag}", rows, tag=tag, **config)
+
+
+@pytest.fixture
+def runs(tmp_path):
+    folder = tmp_path / "runs"
+    performed(folder, "best", "cem", {"forward": [20, 40], "jump": [10, 10]})
+    performed(folder, "best", "icem", {"forward": [40, 60], "jump": [20, 20]})
+    performed(folder, "best", "refit-icem", {"forward": [80, 80], "jump": [30, 50]})
+    performed(folder, "random", "icem", {"forward": [10, 30], "jump": [0, 0]}, 20.0)
+    return folder
+
+
+@pytest.fixture
+def ceilings(tmp_path):
+    path = tmp_path / "simulator.jsonl"
+    rows = [{"task": "forward", "return": x, "steps": 10} for x in (40, 60)]
+    rows += [{"task": "jump", "return": 20, "steps": 10}]
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path
+
+
+def test_a_score_is_a_share_of_what_the_simulator_reaches(runs, ceilings, tmp_path):
+    path = tmp_path / "effects.json"
+    flags = ["--ceilings", str(ceilings), "--json", str(path)]
+    assert effects.main([str(runs), *flags]) == 0
+    found = json.loads(path.read_text())
+    forward = found["icem"]["best"]["forward"]
+    # The simulator has 5 a step, so 100 in 20 steps.
+    assert forward["score"] == {"0": 0.4, "1": 0.6}
+    assert forward["seeds"] == {"0": 40, "1": 60} and forward["steps"] == 600
+    assert forward["kept"] == 0.5 and forward["upright"] == 0.5
+    assert found["icem"]["random"]["jump"]["kept"] is None  # it planned nothing
+
+
+def test_tables_compare_what_is_one_apart(runs, ceilings, capsys):
+    assert effects.main([str(runs), "--ceilings", str(ceilings)]) == 0
+    text = capsys.readouterr().out
+    assert "| `best` | 0.50 [0.40, 0.60] | 0.50 [0.50, 0.50] | 0.50 | 0.50 |" in text
+    pairs = text.partition("one variant less another")[2]
+    # By seed 0.45 and 0.55 less 0.225 and 0.325.
+    assert "| best, icem | best, cem | 22 [" in pairs
+    assert "| best, refit-icem | best, icem |" in pairs
+    assert "| best, refit-icem | best, cem |" not in pairs
+    assert "random, cem" not in pairs
+
+
+def test_what_cannot_be_read_is_said(runs, ceilings, tmp_path, capsys):
+    def said(*flags):
+        assert effects.main([str(runs), *map(str, flags)]) == 2
+        return capsys.readouterr().err
+
+    assert "nothing for jump" in said("--ceilings", _without(ceilings, "jump"))
+    assert "no trials of the simulator" in said("--ceilings", tmp_path / "none")
+    assert "no run has performed" in said("--ceilings", ceilings, "--explored", 5)
+    ceilings.write_text('{"task": "jump", "return": 1, "steps": 0}')
+    assert "Expected `int` >= 1" in said("--ceilings", ceilings)
+
+
+def _without(path, task):
+    lines = [line for line in path.read_text().splitlines() if task not in line]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_the_interval_of_an_iqm_draws_seeds_within_tasks():
+    """Tasks that differ and seeds that do not: nothing is left to chance."""
+    same = np.repeat([[0.0], [1.0], [2.0], [7.0]], 5, axis=1)
+    assert stats.stratified_interval(same) == (1.5, 1.5)
+    scores = np.random.default_rng(0).normal(size=(10, 10))
+    low, high = stats.stratified_interval(scores)
+    # About two standard errors of a mean of 100 to each side; an IQM has a tenth more.
+    assert low < stats.iqm(scores.reshape(-1)) < high
+    assert 0.3 < high - low < 0.6
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    return runpy.run_path(str(TASKS))["tasks"]()
+
+
+@pytest.mark.parametrize(
+    ("task", "entries"),
+    [
+        ("run-upright", {cheetah.FORWARD_VELOCITY: 5.0}),
+        ("back-upright", {cheetah.FORWARD_VELOCITY: -5.0}),
+        ("slow", {cheetah.FORWARD_VELOCITY: 2.0}),
+        ("fast-back", {cheetah.FORWARD_VELOCITY: -4.0}),
+        ("jump", {cheetah.HEIGHT: 0.6}),
+        ("crouch", {cheetah.HEIGHT: -0.25}),
+        ("on-back", {cheetah.PITCH: np.pi}),
+        ("rear-up", {cheetah.PITCH: -np.pi / 2}),
+        ("nose-stand", {cheetah.PITCH: np.pi / 2}),
+        ("hind-walk", {cheetah.PITCH: -np.pi / 2, cheetah.FORWARD_VELOCITY: 1.0}),
+        ("turn-a-second", {cheetah.PITCH_RATE: 2 * np.pi}),
+        ("upright", {cheetah.PITCH: 2 * np.pi}),
+    ],
+)
+def test_a_task_is_worth_most_where_it_is_done(tasks, task, entries):
+    """More than in another posture; more than standing still, which is upright too."""
+
+    def reward(entries):
+        obs = jnp.zeros(cheetah.OBS_SIZE)
+        for entry, value in entries.items():
+            obs = obs.at[entry].set(value)
+        actions = jnp.zeros(cheetah.ACTION_SIZE)
+        return float(tasks[task](None, jnp.zeros_like(obs), actions, obs))
+
+    done, on_its_side = reward(entries), reward({cheetah.PITCH: np.pi / 4})
+    assert done >= 0.99
+    assert done > on_its_side
+    assert done > reward({}) or task == "upright"
+
+
+def test_the_papers_tasks_are_those_of_the_robot(tasks):
+    weights = cheetah.tasks()
+    obs = jnp.linspace(-1.0, 2.0, cheetah.OBS_SIZE)
+    action = jnp.linspace(-1.0, 1.0, cheetah.ACTION_SIZE)
+    for i, name in enumerate(cheetah.TASK_NAMES):
+        own = cheetah.TaskWeights(*(weight[i] for weight in weights))
+        wanted = cheetah.task_reward(own, obs, action, obs)
+        assert tasks[name](None, obs, action, obs) == pytest.approx(float(wanted))

@@ -1,0 +1,27 @@
+"""How much of a model a block of mma_rollout.cu has."""
+
+import pytest
+from layers import SIZES
+
+from jaxpets._src.kernel.mma_layout import SHARED_MEMORY, MmaLayout
+
+
+def test_two_blocks_share_a_multiprocessor_of_any_gpu_if_they_can():
+    """Of 100 KiB, of which CUDA takes one for each block. Large models are alone."""
+    tiles = {}
+    larger = {"quadruped": (60, 12, 63, (256,) * 4), "largest": (128, 128, 128, (256,))}
+    for name, sizes in (SIZES | larger).items():
+        layout = MmaLayout(*sizes)
+        tiles[name] = layout.ring()["TILES"]
+        assert layout.shared_bytes(tiles[name]) <= SHARED_MEMORY
+        assert name in larger or layout.shared_bytes(tiles[name]) <= 49 * 1024
+    assert tiles == dict.fromkeys(SIZES, 5) | {"quadruped": 5, "largest": 3}
+
+
+@pytest.mark.parametrize(
+    ("widest", "width"),
+    [(1, 24), (33, 64), (64, 64), (96, 96), (97, 128), (200, 200), (225, 256)],
+)
+def test_few_columns_are_shared_by_all_warps(widest, width):
+    """Of 64 at most 32. More are filled up, so that each warp has some alone."""
+    assert MmaLayout(18, 6, 18, (widest,)).width == width
