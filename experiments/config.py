@@ -264,15 +264,10 @@ class Tuning:
 
 
 @dataclasses.dataclass(frozen=True)
-class Distilling:
-    """What a policy depends on besides."""
+class Science(Tuning, Evaluation, Exploration):
+    """Everything that decides about numbers."""
 
     distill: DistillingConfig = DistillingConfig()
-
-
-@dataclasses.dataclass(frozen=True)
-class Science(Distilling, Tuning, Evaluation, Exploration):
-    """Everything that decides about numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
