@@ -3,21 +3,28 @@
 The plan alone is one compiled call whose action comes to the host. `act` checks and
 copies the observation besides, and keeps what it did for `observe`. `added_ms` is the
 median of the differences, pair by pair.
+
+With `--policy` it is a step of a distilled policy instead, which needs no plan: by
+onnxruntime on one thread, and by JAX, one after the other.
 """
 
 import argparse
+import importlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+import optax
 
 import jaxpets
 from benchmarks import rows, timing, workloads
+from jaxpets import policies
 from jaxpets.envs import half_cheetah
 
 COLUMNS = ("added_ms", "act_ms", "act_p99_ms", "plan_ms", "plan_p99_ms", "size",
            "engine")  # fmt: skip
+OF_POLICY = ("onnx_us", "onnx_min_us", "jax_us", "jax_min_us", "hidden_size")
 Call = Callable[[], np.ndarray]
 
 
@@ -61,6 +68,55 @@ def calls(size: workloads.Size, planner: jaxpets.Planner) -> tuple[Call, Call]:
     )
 
 
+def policy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yields one row of a policy of HalfCheetah's tasks, at the width of its config."""
+    size = policies.DistillConfig().hidden_size
+    onnx, own = (timing.repeat(x, repeats=args.repeats) for x in policy_calls(size))
+    yield rows.make_row(
+        "agent policy",
+        {"hidden_size": size},
+        onnx_us=1e3 * onnx.median_ms,
+        onnx_min_us=1e3 * onnx.min_ms,
+        jax_us=1e3 * own.median_ms,
+        jax_min_us=1e3 * own.min_ms,
+        repeats=args.repeats,
+    )
+
+
+def policy_calls(hidden_size: int) -> tuple[Call, Call]:
+    """Returns a step of a policy by onnxruntime, and by JAX."""
+    onnxruntime = importlib.import_module("onnxruntime")
+    one = np.ones(half_cheetah.ACTION_SIZE, np.float32)
+    box: Any = {"action_low": -one, "action_high": one}
+    task, key = half_cheetah.task("forward"), jax.random.key(0)
+    space = half_cheetah.model_space()
+    learner = policies.actor_critic(
+        lambda params, key, obs, action: obs,
+        half_cheetah.task_reward,
+        optax.adam(1e-3),
+        policies.ActorCriticConfig(hidden_size=hidden_size),
+        space,
+        obs_size=half_cheetah.OBS_SIZE,
+        goals=policies.Goals(features=jax.numpy.stack),
+        **box,
+    )
+    dataset = workloads.dataset(key, 100, 100)
+    params = learner.init(jaxpets.PlanParams((), task), key, dataset).params
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(
+        policies.to_onnx(params, space, obs_size=half_cheetah.OBS_SIZE, **box), options
+    )
+    obs = np.asarray(dataset.data.obs[0])
+    given = {"obs": obs[None], "task": np.stack(task)[None]}
+    step = jax.jit(learner.policy.step)
+    known = jaxpets.PlanParams((), policies.Guided(task, params))
+    return (
+        lambda: session.run(None, given)[0],
+        lambda: np.asarray(step(known, key, (), obs)[0].action),
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Parses the flags, measures and reports."""
     parser = rows.parser(__doc__)
@@ -72,7 +128,10 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
         "--engine", choices=workloads.ENGINES, default="kernel", help="what imagines"
     )
     parser.set_defaults(size="laptop", repeats=1000)
+    parser.add_argument("--policy", action="store_true", help="a policy, not a plan")
     args = parser.parse_args(argv)
+    if args.policy:
+        return rows.report(policy(args), OF_POLICY, args.json)
     return rows.report(run(args), COLUMNS, args.json)
 
 

@@ -13,7 +13,7 @@ from jax import Array
 import jaxpets
 from jaxpets.envs import Robot
 from jaxpets.models import without_noise
-from jaxpets.policies import ActorCritic
+from jaxpets.policies import ActorCritic, prior
 
 from . import robots
 from .acting import Bind
@@ -32,7 +32,7 @@ KERNEL, SCAN, NOTHING = "kernel", "scan", "none"
 Learn = Callable[[Array, State, Any], tuple[State, Any]]
 
 # Every phase draws from its own stream of keys.
-EXPLORE, ZERO_SHOT, FINETUNE, REFIT, CRITIC = 0, 1, 2, 3, 4
+EXPLORE, ZERO_SHOT, FINETUNE, REFIT, CRITIC, DISTILL = range(6)
 
 
 class Parts(NamedTuple):
@@ -43,6 +43,8 @@ class Parts(NamedTuple):
     random: jaxpets.Planner
     explorer: jaxpets.Planner  # phase 1
     actor: jaxpets.Planner  # phase 2; reward data are a task's params, or Guided
+    # The same with a policy, whose actions a search begins with; data are Guided.
+    with_policy: Callable[[jaxpets.Planner, jaxpets.typing.RewardFn], jaxpets.Planner]
     critic: ActorCritic | None  # what guides zero-shot
     learner: jaxpets.Learner  # phase 1
     reward_data: jaxpets.RewardData  # of its reward
@@ -84,6 +86,18 @@ def build(config: Config) -> Parts:
         precision = jaxpets.Precision(config.task_planner.precision)
         model = _ensemble(robot, size, precision)
         critic = make_critic(config, robot, model, terminal_fn)
+
+    def with_policy(
+        policy: jaxpets.Planner, reward_fn: jaxpets.typing.RewardFn
+    ) -> jaxpets.Planner:
+        if config.pessimism:
+            reward_fn = jaxpets.rewards.pessimistic(reward_fn, config.pessimism)
+        search, count = config.task_planner, size.num_members
+        begins = prior(
+            policy, trained.sample, horizon=search.horizon, num_members=count
+        )
+        return planner(reward_fn, search, propose_fn=begins)[0]
+
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
     def learner(
@@ -114,6 +128,7 @@ def build(config: Config) -> Parts:
         random=random,
         explorer=explorer,
         actor=actor,
+        with_policy=with_policy,
         critic=critic,
         learner=learner(
             config.training, arm.reward_data, config.trial_length, explored

@@ -37,8 +37,8 @@ PRETRAINED = Path(__file__).with_name("pretrained")
 def parse(argv: Sequence[str], source: Config | None = None) -> Config:
     """Returns the validated Config of a command line.
 
-    zero-shot and finetune take their defaults from the run they start from, so that a
-    preset or a number need not be said twice.
+    zero-shot, finetune and distill take their defaults from the run they start from, so
+    that a preset or a number need not be said twice.
 
     Args:
       argv: the command line.
@@ -51,9 +51,9 @@ def parse(argv: Sequence[str], source: Config | None = None) -> Config:
     """
     phase, rest = _phase(argv)
     config = _config(phase, rest, _preset(rest))  # what is wrong comes before the run
-    if phase in ("zero-shot", "finetune"):
+    if phase in ("zero-shot", "finetune", "distill"):
         explored = _numbers(source) if source else _explored(config)
-        if phase == "finetune":  # which has none; what zero-shot had is not its own
+        if phase != "zero-shot":  # which alone has one
             explored = dataclasses.replace(explored, critic=CriticConfig())
         config = _config(phase, rest, explored)
         check_explored(config, explored)
@@ -178,8 +178,8 @@ def _numbers(explored: Config) -> Config:
 def _check_pretrained(config: Config) -> None:
     """Refuses to learn where nothing is to learn on."""
     if explored_run(config).parent == PRETRAINED.resolve():
-        valid = "zero-shot; a model that comes with the code performs, no more"
-        require(config.phase == "zero-shot", "--phase", config.phase, valid)
+        valid = "zero-shot or distill; a model that comes with the code has no data"
+        require(config.phase != "finetune", "--phase", config.phase, valid)
         valid = "0; a model that comes with the code has no data"
         epochs, updates = config.refit.num_epochs, config.critic.num_updates
         require(epochs == 0, "--refit.num-epochs", epochs, valid)

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal, get_args
 from msgspec import Meta
 
 from jaxpets import EnsembleConfig, FitConfig
-from jaxpets.policies import ActorCriticConfig
+from jaxpets.policies import ActorCriticConfig, DistillConfig
 
 from .place import Compute, Origin, Output, Process, Steps
 from .storage.rundir import HALF_CHEETAH
 
-Phase = Literal["explore", "zero-shot", "finetune", "report"]
+Phase = Literal["explore", "zero-shot", "finetune", "distill", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
 ArmName = Literal[
     "epistemic",
@@ -168,6 +168,24 @@ class CriticConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class DistillingConfig:
+    """A policy for all tasks that acts as the planner would, without a plan."""
+
+    num_rounds: Annotated[int, Meta(ge=1, le=10_000)] = 10
+    """Times that the planner is asked, the policy learns and then acts."""
+    num_trials: Annotated[int, Meta(ge=1, le=10_000)] = DistillConfig.num_trials
+    """Imagined trials side by side in which the planner is asked, at least."""
+    horizon: Annotated[int, Meta(ge=1, le=100_000)] = 250
+    """Steps that they are imagined for in a round."""
+    num_updates: Annotated[int, Meta(ge=1, le=1_000_000)] = 4000
+    """Gradient steps in a round."""
+    learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
+    """Of Adam, at first; it falls to a twentieth."""
+    hidden_size: Annotated[int, Meta(ge=1, le=8192)] = DistillConfig.hidden_size
+    """Width of the policy's two layers."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Phased:
     """What is to be done."""
 
@@ -248,6 +266,8 @@ class Tuning:
 @dataclasses.dataclass(frozen=True)
 class Science(Tuning, Evaluation, Exploration):
     """Everything that decides about numbers."""
+
+    distill: DistillingConfig = DistillingConfig()
 
 
 @dataclasses.dataclass(frozen=True)

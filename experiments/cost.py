@@ -81,6 +81,9 @@ def memory_advice(config: Config) -> str:
             flags = ["--critic.batch-size", *flags[: 2 * (not config.critic.acts)]]
         trials *= config.eval_trials
         flags.insert(0, "--eval-trials")
+    if config.phase == "distill":
+        trials = max(trials * config.eval_trials, config.distill.num_trials)
+        flags = ["--eval-trials", "--distill.num-trials", *flags]
     return (
         f"out of memory. {learned}{seeds} seeds x {trials} trials x "
         f"{search.num_samples} samples x {search.num_particles} particles x horizon "
@@ -118,6 +121,10 @@ def _planned_steps(config: Config) -> int:
     if config.phase == "explore":
         planned = config.num_trials - config.random_trials
         return planned * config.trial_length if config.arm not in UNPLANNED else 0
-    zero_shot = config.phase == "zero-shot"
-    trials = config.eval_trials if zero_shot else config.finetune_trials
-    return _num_tasks(config) * trials * config.task_length
+    tuned = config.phase == "finetune"
+    trials = config.finetune_trials if tuned else config.eval_trials
+    planned = _num_tasks(config) * trials * config.task_length
+    if config.phase == "distill":  # the planner performs alone and with the policy
+        asked = config.distill
+        planned = 2 * planned + asked.num_rounds * asked.num_trials * asked.horizon
+    return planned

@@ -50,6 +50,14 @@ class Finetune(ZeroShot):
 
 
 @dataclasses.dataclass(frozen=True)
+class Distill(ZeroShot):
+    """Phase 2 in a network: acts as the planner would, on any task.
+
+    Settings are those of the exploration run unless a flag says otherwise.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
 class Report:
     """Makes tables and figures of all logs in a folder."""
 
@@ -68,6 +76,7 @@ COMMANDS = {
     "explore": Explore,
     "zero-shot": ZeroShot,
     "finetune": Finetune,
+    "distill": Distill,
     "report": Report,
 }
 _ABOUT = """Unsupervised exploration with deep model-based RL, of any robot.
@@ -123,7 +132,7 @@ def explain(default: Config) -> None:
         default=part(default, Overview),
         description=_ABOUT.format("\n".join(phases)),
         registry=_AS_WRITTEN,
-        prog=calling.usage("run", f"{{{','.join(COMMANDS)}}}"),
+        prog=calling.usage("run", "PHASE"),
     )
 
 

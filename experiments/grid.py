@@ -119,7 +119,7 @@ def _table(name: str, flags: Flags) -> Grid:
 def _phase(later: Flags) -> list[str]:
     flags = _flat(later)
     phase = flags.pop("phase", None)
-    if phase not in ("zero-shot", "finetune"):
+    if phase not in ("zero-shot", "finetune", "distill"):
         raise UsageError(
             f"then.phase {printable(repr(phase))} is not valid; it must be zero-shot "
             "or finetune."

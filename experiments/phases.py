@@ -125,8 +125,8 @@ class _Finetuning:
 def explore(config: Config, run: RunFolder, watch: Watch) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
-    _say_rollout(run, parts.explored_by)
-    placement = _placement(run, len(config.seeds))
+    say_rollout(run, parts.explored_by)
+    placement = placed(run, len(config.seeds))
     length, horizon = config.chunk_length, config.planner.horizon
     robot = parts.robot
     phase = _Exploration(
@@ -169,9 +169,9 @@ def zero_shot(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    _say_rollout(run, parts.performed_by)
+    say_rollout(run, parts.performed_by)
     model = prepared(config, source, run, step, parts, tasks)
-    placement = _placement(run, len(config.seeds), len(names), config.eval_trials)
+    placement = placed(run, len(config.seeds), len(names), config.eval_trials)
     task_params = devices.place(placement, tasks.params, TASK)
     horizon, axes = float(config.task_planner.horizon), P(TASK)
     if parts.critic:
@@ -220,10 +220,10 @@ def finetune(
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
     """
     parts = build(config)
-    _say_rollout(run, parts.performed_by)
+    say_rollout(run, parts.performed_by)
     robot = parts.robot
     tasks = robots.chosen(config, robot)
-    placement = _placement(run, len(config.seeds), len(tasks.names))
+    placement = placed(run, len(config.seeds), len(tasks.names))
     phase = _Finetuning(
         config=config,
         scorer=acting.scorer(robot),
@@ -262,7 +262,7 @@ def finetune(
         run.save_trajectories(paths)
 
 
-def _say_rollout(run: RunFolder, rollout: str) -> None:
+def say_rollout(run: RunFolder, rollout: str) -> None:
     """Warns where numbers may be others than those so far, or come slowly."""
     lines = [
         f"{line}; the last bits may differ" for line in run.computes(rollout=rollout)
@@ -273,7 +273,7 @@ def _say_rollout(run: RunFolder, rollout: str) -> None:
         run.say(f"warning: {line}")
 
 
-def _placement(run: RunFolder, *counts: int) -> Placement:
+def placed(run: RunFolder, *counts: int) -> Placement:
     """Spreads branches over hosts and devices, and says what stays idle."""
     placement = devices.spread(*counts)
     if line := devices.idle(placement):

@@ -5,6 +5,7 @@ from typing import Any
 
 from .config import (
     Config,
+    DistillingConfig,
     ModelConfig,
     PlannerConfig,
     Preset,
@@ -30,6 +31,7 @@ _SMOKE_PLANNER = PlannerConfig(
     precision="f32",
 )
 _NO_REFIT = TrainingConfig(0)
+_LAPTOP_DISTILL = DistillingConfig(num_trials=20, horizon=150, num_updates=2000)
 # The laptop plans about 20,000 and not 1,500,000 model steps an action with a network a
 # third as large, and trains longer on the little data there is, so that nothing is left
 # for a refit. Many short trials beat few long ones.
@@ -50,6 +52,7 @@ PRESETS = {
         tuning=TrainingConfig(20, 64, 2e-3, final_rate=0.02),
         planner=_LAPTOP_PLANNER,
         task_planner=dataclasses.replace(_LAPTOP_PLANNER, noise_beta=0.5),
+        distill=_LAPTOP_DISTILL,
     ),
     "smoke": Config(
         preset="smoke",
@@ -66,12 +69,14 @@ PRESETS = {
         tuning=TrainingConfig(1, 16),
         planner=_SMOKE_PLANNER,
         task_planner=_SMOKE_PLANNER,
+        distill=DistillingConfig(2, num_trials=6, horizon=4, num_updates=3),
     ),
 }
 
 
 # What models that come with the code perform with: the laptop's search, further ahead.
 PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
+PRETRAINED_DISTILL = PRESETS["laptop"].distill
 # How `best` performs: a longer refit, of every member on every row, and a search from
 # fewer elites in noise that keeps its direction for a while.
 _BEST_REFIT = TrainingConfig(800, 256, final_rate=0.005, bootstrap=False)

@@ -1,4 +1,4 @@
-"""`python -m experiments.run {explore,zero-shot,finetune,report}`: the command line."""
+"""The command line: `python -m experiments.run {explore,zero-shot,...,report}`."""
 
 import os
 import sys
@@ -97,10 +97,14 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / cli.variant(config, step)
     with _opened(config, folder) as run:
-        from . import phases
+        from . import distilling, phases
 
-        phase = phases.zero_shot if config.phase == "zero-shot" else phases.finetune
-        phase(config, source, run, step, watch)
+        perform = {
+            "zero-shot": phases.zero_shot,
+            "finetune": phases.finetune,
+            "distill": distilling.distill,
+        }[config.phase]
+        perform(config, source, run, step, watch)
         if config.video is not None and distributed.is_first():
             with_gl()
             _video(config, run, step, watch)

@@ -64,8 +64,9 @@ def _check_critic(config: Config) -> None:
     if not updates:
         alone = "False without --critic.num-updates"
         require(not config.critic.acts, "--critic.acts", True, alone)
-    if config.phase == "finetune":
-        require(not updates, "--critic.num-updates", updates, "0 in finetune")
+    if config.phase in ("finetune", "distill"):
+        valid = f"0 in {config.phase}"
+        require(not updates, "--critic.num-updates", updates, valid)
     if updates:
         alone = "0 with a critic, which is asked about one member at a time"
         require(not config.pessimism, "--pessimism", config.pessimism, alone)

@@ -2,7 +2,8 @@
 
 Functions named by a noun build: they take functions, sizes and options, and return a
 record of pure functions, such as a Planner with `init` and `step`. Functions named by a
-verb act. (`plan` builds too: a rollout, a reward and a search become a planner.)
+verb act. (`plan` and `distill` build too: a rollout, a reward and a search become a
+planner, and a planner becomes a policy.)
 Nothing is jitted, keeps state or draws from a global key. All arrays are float32, and
 all keys typed (`jax.random.key`).
 
@@ -27,6 +28,7 @@ candidate at one step, `[E, P, D]`, and returns `[E, P]` or `[]`.
 from jaxpets import datasets, optimizers, rewards, typing
 from jaxpets._src.agent import agent
 from jaxpets._src.check_space import check_space
+from jaxpets._src.distill import distill
 from jaxpets._src.ensemble import Ensemble, delta_space, ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig
 from jaxpets._src.ensemble_params import EnsembleParams
@@ -72,6 +74,7 @@ __all__ = [
     "check_space",
     "datasets",
     "delta_space",
+    "distill",
     "ensemble",
     "fitter",
     "fused_rollout",

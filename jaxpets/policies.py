@@ -10,6 +10,15 @@ from jaxpets._src.actor_critic_records import (
     Goals,
     Guided,
 )
+from jaxpets._src.distill_records import (
+    DistillConfig,
+    Distiller,
+    DistillMetrics,
+    DistillState,
+)
+from jaxpets._src.policy_file import load_policy, save_policy
+from jaxpets._src.policy_onnx import to_onnx
+from jaxpets._src.prior import prior
 
 __all__ = [
     "ActorCritic",
@@ -17,7 +26,15 @@ __all__ = [
     "ActorCriticMetrics",
     "ActorCriticParams",
     "ActorCriticState",
+    "DistillConfig",
+    "DistillMetrics",
+    "DistillState",
+    "Distiller",
     "Goals",
     "Guided",
     "actor_critic",
+    "load_policy",
+    "prior",
+    "save_policy",
+    "to_onnx",
 ]

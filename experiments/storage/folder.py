@@ -5,7 +5,7 @@ reads or fails at gets to the others.
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,16 +15,7 @@ import numpy as np
 from .. import errors
 from ..errors import StorageError
 from ..parallel import distributed
-from . import (
-    checkpoint,
-    disk,
-    identity,
-    metrics,
-    pytrees,
-    rundir,
-    status,
-    trajectories,
-)
+from . import checkpoint, disk, identity, metrics, pytrees, rundir, status, trajectories
 from .environment import environment, remember
 from .identity import Differences
 from .status import Writer
@@ -157,6 +148,15 @@ class RunFolder(NamedTuple):
     def save_trajectories(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes what a video is made of."""
         distributed.on_first(lambda: trajectories.save(self.trajectories, arrays))
+
+    def export(self, name: str, write: Callable[[Path], object]) -> None:
+        """Replaces a file that only others read by what `write` writes."""
+
+        def replace() -> None:
+            with disk.replaced(self.path / name) as target:
+                write(target)
+
+        distributed.on_first(replace)
 
     def computes(self, **entries: str) -> list[str]:
         """Keeps what computes the run's numbers beside the rest of its environment.

@@ -3,7 +3,8 @@
 A row is a trial of a seed, and of a task where one is sought:
 
     phase, arm, seed, trial  exploration has planner and steps too, the others task and
-                             explored_trials, the trials behind their model
+                             explored_trials, the trials behind their model; in distill
+                             the planner is plan, policy, or both
     value                    predicted reward per imagined step
     turns                    net turns of the torso, nose down; left out of a robot of
                              which none are counted
@@ -107,6 +108,10 @@ class _Finetune(_ZeroShot, tag="finetune"):
     pass
 
 
+class _Distill(_ZeroShot, tag="distill"):
+    pass
+
+
 def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
     """Yields the rows of a log of a run with this config, in JSON.
 
@@ -125,7 +130,7 @@ def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def _parsed(data: Any, config: Mapping[str, Any], run: Path) -> Row:
-    line = msgspec.convert(data, _Explore | _ZeroShot | _Finetune)
+    line = msgspec.convert(data, _Explore | _ZeroShot | _Finetune | _Distill)
     if fit := data.get("fit"):
         fit = {_RENAMED.get(name, name): value for name, value in fit.items()}
         data = data | {"fit": fit}

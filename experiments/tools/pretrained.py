@@ -20,7 +20,7 @@ from ..build import State, build
 from ..config import Config
 from ..entries import to_json
 from ..errors import RunError, UsageError
-from ..presets import PRETRAINED_PLANNER
+from ..presets import PRETRAINED_DISTILL, PRETRAINED_PLANNER
 from ..storage import disk, metrics, rundir
 from ..storage.folder import RunFolder
 
@@ -58,6 +58,7 @@ def ship(run: Path, name: str, seed: int | None = None) -> Path:
         eval_trials=1,
         refit=dataclasses.replace(config.refit, num_epochs=0),  # as it performed
         task_planner=PRETRAINED_PLANNER,
+        distill=PRETRAINED_DISTILL,
     )
     model = RunFolder(folder)
     model.save(step, state)

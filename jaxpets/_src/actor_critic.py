@@ -10,33 +10,34 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxpets._src.action_box import action_box
-from jaxpets._src.actor_critic_networks import build_networks
+from jaxpets._src.actor_critic_networks import build_networks, guided_reward
 from jaxpets._src.actor_critic_records import (
     ActorCritic,
     ActorCriticConfig,
     ActorCriticMetrics,
     ActorCriticState,
     Goals,
-    Guided,
 )
 from jaxpets._src.actor_critic_update import build_update
 from jaxpets._src.checks import (
-    check_array,
     check_callable,
     check_count,
-    check_key,
     check_record,
 )
 from jaxpets._src.fitter import Optimizer, check_optimizer
-from jaxpets._src.imagined_trials import imagine
-from jaxpets._src.returns import single_reward
+from jaxpets._src.imagined_trials import (
+    check_imagined,
+    imagine,
+    renewed,
+    reward_range,
+    trial_starts,
+)
 from jaxpets._src.types import (
     Dataset,
     DynamicsFn,
     ModelSpace,
     PlanParams,
     RewardFn,
-    Transition,
 )
 
 _NO_GOALS = Goals()
@@ -118,19 +119,15 @@ def actor_critic(
         return box.center + box.half_width * jnp.clip(action, -1.0, 1.0)
 
     run = imagine(dynamics_fn, reward_fn, terminal_fn, explore, config.horizon)
-
-    def starts(params: PlanParams, key: Array, dataset: Dataset) -> tuple[Array, Any]:
-        row_key, draw_key = jax.random.split(key)
-        chosen = jax.random.randint(row_key, rows, 0, jnp.maximum(dataset.size, 1))
-        draw = jax.vmap(jax.vmap(goals.draw, (None, 0)), (None, 0))
-        rewards = draw(params.reward, jax.random.split(draw_key, rows))
-        return dataset.data.obs[chosen], rewards
+    starts = trial_starts(goals.draw, rows)
 
     def init(params: PlanParams, key: Array, dataset: Dataset) -> ActorCriticState:
-        _check(params, key, dataset, obs_size)
+        check_imagined(params, key, dataset, obs_size)
         start_key, draw_key, network_key = jax.random.split(key, 3)
-        obs, rewards = starts(params, start_key, dataset)
-        low, high = _reward_range(reward_fn, goals, params.reward, draw_key, dataset)
+        obs, rewards = starts(params.reward, start_key, dataset)
+        low, high = reward_range(
+            reward_fn, goals.draw, params.reward, draw_key, dataset
+        )
         largest = jnp.maximum(high, -low)
         scale = (1.0 - config.discount) / jnp.where(largest > 0.0, largest, 1.0)
         goal = goals_of(rewards).reshape(rows[0] * rows[1], -1)
@@ -158,18 +155,15 @@ def actor_critic(
         again |= jnp.arange(rows[1]) < (rows[1] + 1) // 2
         again |= ~(steps.counts[-1] & steps.goes_on[-1])
 
-        def renewed(new: Array, old: Array) -> Array:
-            return jnp.where(again.reshape(*rows, *(1,) * (old.ndim - 2)), new, old)
-
-        fresh = starts(params, start_key, dataset)
-        obs, rewards = jax.tree.map(renewed, fresh, (steps.next_obs[-1], state.rewards))
+        fresh = starts(params.reward, start_key, dataset)
+        obs, rewards = renewed(again, fresh, (steps.next_obs[-1], state.rewards))
         metrics = ActorCriticMetrics(value, jnp.mean(steps.reward), skipped)
         return state._replace(obs=obs, rewards=rewards), metrics
 
     def step(
         params: PlanParams, key: Array, state: ActorCriticState, dataset: Dataset
     ) -> tuple[ActorCriticState, ActorCriticMetrics]:
-        _check(params, key, dataset, obs_size)
+        check_imagined(params, key, dataset, obs_size)
         check_record("state", state, ActorCriticState)
         keys = jax.random.split(key, config.num_updates)
         state, every = jax.lax.scan(
@@ -179,31 +173,5 @@ def actor_critic(
         value, reward = jnp.mean(every.value), jnp.mean(every.reward)
         return state, ActorCriticMetrics(value, reward, num_skipped)
 
-    def guided(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
-        check_record("params.reward", data, Guided)
-        return reward_fn(data.reward, obs, action, next_obs)
-
-    return ActorCritic(init, step, networks.policy, guided, networks.value_fn)
-
-
-def _check(params: Any, key: Any, dataset: Any, obs_size: int) -> None:
-    check_record("params", params, PlanParams)
-    check_key("key", key)
-    check_record("dataset", dataset, Dataset)
-    check_array("dataset.data.obs", dataset.data.obs, ["C", obs_size])
-
-
-def _reward_range(
-    reward_fn: RewardFn, goals: Goals, data: Any, key: Array, dataset: Dataset
-) -> tuple[Array, Array]:
-    """Returns the least and the largest reward of the data, 0 among them."""
-    one = single_reward(reward_fn)
-
-    def of_row(key: Array, row: Transition) -> Array:
-        return one(goals.draw(data, key), *row)
-
-    capacity = dataset.data.obs.shape[0]
-    rewards = jax.vmap(of_row)(jax.random.split(key, capacity), dataset.data)
-    used = (jnp.arange(capacity) < dataset.size) & jnp.isfinite(rewards)
-    rewards = jnp.where(used, rewards, 0.0)
-    return jnp.minimum(jnp.min(rewards), 0.0), jnp.maximum(jnp.max(rewards), 0.0)
+    reward = guided_reward(reward_fn)
+    return ActorCritic(init, step, networks.policy, reward, networks.value_fn)

@@ -12,10 +12,17 @@ from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
 from jaxpets._src.checks import check_record
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Head
-from jaxpets._src.types import Dataset, ModelSpace, Planner, PlanOutput, PlanParams
+from jaxpets._src.types import (
+    Dataset,
+    ModelSpace,
+    Planner,
+    PlanOutput,
+    PlanParams,
+    RewardFn,
+)
 
 # Whitened inputs are cut off here: imagination may leave the data.
-_CLIP = 10.0
+CLIP = 10.0
 
 
 class Networks(NamedTuple):
@@ -62,7 +69,7 @@ def build_networks(
     def see(params: ActorCriticParams, goal: Array, obs: Array) -> Array:
         goal = jnp.broadcast_to(goal, (*obs.shape[:-1], goal.shape[-1]))
         seen = jnp.concatenate([space.features(obs), goal], axis=-1)
-        return jnp.clip((seen - params.mean) / params.std, -_CLIP, _CLIP)
+        return jnp.clip((seen - params.mean) / params.std, -CLIP, CLIP)
 
     def judge(critics: Any, seen: Array, action: Array) -> Array:
         inputs = jnp.concatenate([seen, action], axis=-1)
@@ -88,3 +95,13 @@ def build_networks(
 
     policy = Planner(lambda: (), step)
     return Networks(init, see, propose, judge, policy, value_fn)
+
+
+def guided_reward(reward_fn: RewardFn) -> RewardFn:
+    """Returns a reward that reads its data from Guided."""
+
+    def reward(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
+        check_record("params.reward", data, Guided)
+        return reward_fn(data.reward, obs, action, next_obs)
+
+    return reward

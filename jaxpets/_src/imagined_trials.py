@@ -7,12 +7,20 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array
+from jaxpets._src.checks import check_array, check_key, check_record
 from jaxpets._src.returns import single_reward
-from jaxpets._src.types import DynamicsFn, RewardFn
+from jaxpets._src.types import (
+    Dataset,
+    DynamicsFn,
+    PlanParams,
+    RewardFn,
+    Transition,
+)
 
 # `(its params, key, rewards [E, B, ...], obs [E, B, D]) -> action [E, B, A]`.
 PolicyFn = Callable[[Any, Array, Any, Array], Array]
+# `(reward data, key) -> reward data` of one trial.
+DrawFn = Callable[[Any, Array], Any]
 
 
 class Imagined(NamedTuple):
@@ -85,3 +93,56 @@ def imagine(
         return steps
 
     return run
+
+
+def trial_starts(
+    draw: DrawFn, rows: tuple[int, int]
+) -> Callable[[Any, Array, Dataset], tuple[Array, Any]]:
+    """Builds what begins trials `[E, B]` in states of the data, each with its reward.
+
+    Returns:
+      `(reward data, key, dataset) -> (obs [E, B, D], reward data [E, B, ...])`.
+    """
+    draw_all = jax.vmap(jax.vmap(draw, (None, 0)), (None, 0))
+
+    def starts(data: Any, key: Array, dataset: Dataset) -> tuple[Array, Any]:
+        row_key, draw_key = jax.random.split(key)
+        chosen = jax.random.randint(row_key, rows, 0, jnp.maximum(dataset.size, 1))
+        rewards = draw_all(data, jax.random.split(draw_key, rows))
+        return dataset.data.obs[chosen], rewards
+
+    return starts
+
+
+def renewed(again: Array, fresh: Any, old: Any) -> Any:
+    """Returns what trials go on from: `fresh` where they begin `again`, `[E, B]`."""
+
+    def one(new: Array, old: Array) -> Array:
+        rows = again.reshape(*again.shape, *(1,) * (old.ndim - 2))
+        return jnp.where(rows, new, old)
+
+    return jax.tree.map(one, fresh, old)
+
+
+def reward_range(
+    reward_fn: RewardFn, draw: DrawFn, data: Any, key: Array, dataset: Dataset
+) -> tuple[Array, Array]:
+    """Returns the least and the largest reward of the data, 0 among them."""
+    one = single_reward(reward_fn)
+
+    def of_row(key: Array, row: Transition) -> Array:
+        return one(draw(data, key), *row)
+
+    capacity = dataset.data.obs.shape[0]
+    rewards = jax.vmap(of_row)(jax.random.split(key, capacity), dataset.data)
+    used = (jnp.arange(capacity) < dataset.size) & jnp.isfinite(rewards)
+    rewards = jnp.where(used, rewards, 0.0)
+    return jnp.minimum(jnp.min(rewards), 0.0), jnp.maximum(jnp.max(rewards), 0.0)
+
+
+def check_imagined(params: Any, key: Any, dataset: Any, obs_size: int) -> None:
+    """Raises unless these are what trials can be imagined with."""
+    check_record("params", params, PlanParams)
+    check_key("key", key)
+    check_record("dataset", dataset, Dataset)
+    check_array("dataset.data.obs", dataset.data.obs, ["C", obs_size])

@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+# Added to the variance of a layer that is normalised.
+NORM_EPSILON = 1e-6
+
 
 class Precision(enum.Enum):
     """How the matrix products of the network are computed; they add up in float32."""
@@ -55,7 +58,9 @@ class Head(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         for _ in range(2):
-            x = nn.elu(nn.LayerNorm()(nn.Dense(self.hidden_size)(x)))
+            x = nn.elu(
+                nn.LayerNorm(epsilon=NORM_EPSILON)(nn.Dense(self.hidden_size)(x))
+            )
         small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
         return nn.Dense(self.output_size, kernel_init=small)(x)
 

@@ -4,10 +4,12 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import (
+    check_array,
     check_callable,
     check_count,
     check_key,
@@ -37,6 +39,7 @@ def plan(
     discount: float | Array = 1.0,
     risk_fn: Callable[[Array], Array] | None = None,
     value_fn: Callable[[Any, Array], Array] | None = None,
+    propose_fn: Callable[[PlanParams, Array, Any], Array] | None = None,
 ) -> Planner:
     """Builds a model-predictive controller.
 
@@ -81,6 +84,10 @@ def plan(
         particles, float32: what is still to be earned where the horizon ends, counted
         `discount^H`. A reward that is further away than the horizon is found by it.
         None: nothing.
+      propose_fn: `(PlanParams, key, obs) -> actions [H, A]` in the box, as a policy
+        would go on; see `policies.prior`. The search begins at it where it promises
+        more than the last plan, and so never at less. Its state must have a `mean`, as
+        those of `jaxpets.optimizers` have.
 
     Returns:
       A Planner.
@@ -97,6 +104,9 @@ def plan(
     if chunk_size is not None:
         check_count("chunk_size", chunk_size)
 
+    if propose_fn is not None:
+        check_callable("propose_fn", propose_fn)
+        _check_mean(optimizer)
     returns = candidate_returns(reward_fn, terminal_fn, discount, risk_fn, value_fn)
 
     def step(
@@ -122,11 +132,28 @@ def plan(
                 finite, jnp.clip(value, WORST_VALUE, -WORST_VALUE), WORST_VALUE
             )
 
+        if propose_fn is not None:
+            key, propose_key, value_key = jax.random.split(key, 3)
+            proposal = propose_fn(params, propose_key, obs)
+            check_array("propose_fn's result", proposal, state.mean.shape)
+            both = jnp.stack([state.mean, proposal])
+            last, new = objective(value_key, both)
+            state = state._replace(mean=jnp.where(new > last, proposal, state.mean))
         whole = objective if chunk_size is None else chunked(objective, chunk_size)
         solution, state = optimizer.step(whole, key, state)
         return PlanOutput(solution.actions[0], *solution), state
 
     return Planner(optimizer.init, step)
+
+
+def _check_mean(optimizer: TrajectoryOptimizer) -> None:
+    """Raises unless the state of a search says where it begins."""
+    state = jax.eval_shape(optimizer.init)
+    if not hasattr(state, "mean"):
+        kind = type(state).__name__
+        raise TypeError(
+            f"optimizer must have a state with a mean for propose_fn, got {kind}."
+        )
 
 
 def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], Array]:

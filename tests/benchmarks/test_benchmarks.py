@@ -161,6 +161,15 @@ def test_agent(tmp_path):
     assert abs(row["added_ms"]) < row["act_p99_ms"]
 
 
+def test_agent_with_a_policy(tmp_path):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "rows.jsonl"
+    (row,) = agent.main(["--policy", "--repeats", "3", "--json", str(path)])
+    assert json.loads(path.read_text()) == json.loads(json.dumps(row))
+    assert 0 < row["onnx_min_us"] <= row["onnx_us"]
+    assert 0 < row["jax_min_us"] <= row["jax_us"]
+
+
 def test_rollout_and_fit(tmp_path):
     path = tmp_path / "rows.jsonl"
     common = ["--tiny", "--repeats", "2", "--json", str(path)]

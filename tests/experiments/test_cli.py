@@ -254,6 +254,8 @@ def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
     code, line = fail(*LATER, *huge)
     assert code == 2
     assert "--phase zero-shot of --preset smoke would take about 3 hours" in line
+    code, line = fail("distill", *LATER[2:], "--distill.horizon", "100000", *huge[:2])
+    assert code == 2 and "--phase distill of --preset smoke would take" in line
 
 
 @pytest.mark.parametrize(
@@ -266,6 +268,11 @@ def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
             "--seeds, --eval-trials, --task-planner.num-samples",
         ),
         (dict(phase="finetune"), "4 trials", "--seeds, --task-planner.num-samples"),
+        (
+            dict(phase="distill", task="forward"),
+            "6 trials",
+            "--seeds, --eval-trials, --distill.num-trials, --task-planner.num-samples",
+        ),
     ],
 )
 def test_out_of_memory_names_the_flags_of_the_phase(changes, planned, flags):

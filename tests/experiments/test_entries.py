@@ -43,7 +43,7 @@ def test_configs_survive_json(preset, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "wanted"),
     [
-        ("phase", "zzz", "explore, zero-shot, finetune, report"),
+        ("phase", "zzz", "explore, zero-shot, finetune, distill, report"),
         ("preset", "zzz", "laptop, paper, smoke"),
         ("arm", 3, "epistemic, count,"),
         ("env", 3, "text"),

@@ -35,6 +35,20 @@ TASK = policies.actor_critic(
     action_low=ENV.action_low,
     action_high=ENV.action_high,
 )
+# Of the networks of TASK, which are of one size.
+DISTILLED = jaxpets.distill(
+    jaxpets.random_planner(ENV.action_low, ENV.action_high),
+    toys.cart,
+    toys.reach,
+    optax.adam(1e-3),
+    policies.DistillConfig(
+        hidden_size=8, num_trials=2, horizon=2, capacity=4, num_updates=1
+    ),
+    jaxpets.delta_space(),
+    obs_size=2,
+    action_low=ENV.action_low,
+    action_high=ENV.action_high,
+)
 new_network = jax.jit(RND.init)
 NOISY = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=4)
 LEARNED = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
@@ -76,8 +90,13 @@ def warm(init, i):
 
 
 def planner_case(name):
+    random = jaxpets.random_planner(ENV.action_low, ENV.action_high)
     if name == "random":
-        planner = jaxpets.random_planner(ENV.action_low, ENV.action_high)
+        planner = random
+    elif name == "prior":
+        begins = policies.prior(random, toys.noisy_cart, horizon=3, num_members=2)
+        search = toys.optimizer("icem", horizon=3)
+        planner = jaxpets.plan(NOISY, toys.reach, search, propose_fn=begins)
     else:
         planner = jaxpets.plan(NOISY, toys.reach, toys.optimizer(name, horizon=3))
 
@@ -161,15 +180,25 @@ def guided(i):
     return policies.Guided(params.reward, networks)
 
 
-def policy_case():
+def policy_case(policy):
     def variant(i):
         return PlanParams((), guided(i)), key_of(i), (), cart_obs(i)
 
-    return Case(TASK.policy.step, variant, (2, 1))
+    return Case(policy.step, variant, (2, 1))
+
+
+def distill_case():
+    def variant(i):
+        params = PlanParams(jnp.float32(1.0), jnp.float32(i))
+        state = DISTILLED.init(params, key_of(i), dataset(i))
+        return params, key_of(i), state, dataset(i)
+
+    return Case(DISTILLED.step, variant, (2, 0))
 
 
 CASES = {
     **{f"plan-{n}": functools.partial(planner_case, n) for n in toys.OPTIMIZERS},
+    "plan-prior": lambda: planner_case("prior"),
     "random_planner": lambda: planner_case("random"),
     "random_planner-coloured": coloured_case,
     **{n: functools.partial(optimizer_case, n) for n in toys.OPTIMIZERS},
@@ -209,7 +238,9 @@ CASES = {
         hc.task_reward,
         lambda i: (row_of(hc.tasks(), i), *step_of(i, 18, 6)),
     ),
-    "policy": policy_case,
+    "policy": lambda: policy_case(TASK.policy),
+    "distilled-policy": lambda: policy_case(DISTILLED.policy),
+    "distill-plan": distill_case,
     "guided-reward": lambda: Case(TASK.reward_fn, lambda i: (guided(i), *step_of(i))),
     "user-reward": lambda: Case(toys.reach, lambda i: (jnp.float32(i), *step_of(i))),
     "ensemble_std": lambda: Case(

@@ -12,7 +12,7 @@ from cases import CASES, KEYED, STATEFUL
 # Programs that fuse otherwise round otherwise; a search of a few iterations on values
 # that differ by far more than a rounding keeps to 1e-4.
 CLOSE = dict(rtol=1e-4, atol=1e-5)
-UNROLLED = ("icem", "plan-icem", "cem-unrolled", "plan-cem-unrolled")
+UNROLLED = ("icem", "plan-icem", "plan-prior", "cem-unrolled", "plan-cem-unrolled")
 
 
 @functools.cache

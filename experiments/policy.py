@@ -1,0 +1,109 @@
+"""The policy that is distilled from a planner, as a config has it, and its files."""
+
+import functools
+import operator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+import jaxpets
+from jaxpets.envs import Robot, Tasks
+from jaxpets.policies import (
+    ActorCriticParams,
+    DistillConfig,
+    Distiller,
+    Goals,
+    save_policy,
+    to_onnx,
+)
+
+from . import critic
+from .build import Parts, imagined_end
+from .config import Config
+from .storage.folder import RunFolder
+
+
+def make_distiller(config: Config, parts: Parts, tasks: Tasks) -> Distiller:
+    """Returns what learns from the planner of a config."""
+    settings, robot = config.distill, parts.robot
+    rate = optax.cosine_decay_schedule(
+        settings.learning_rate, settings.num_rounds * settings.num_updates, alpha=0.05
+    )
+    plans = settings.num_rounds * settings.num_trials * settings.horizon
+    return jaxpets.distill(
+        parts.with_policy,
+        parts.model.sample,
+        robot.tasks.reward_fn,
+        optax.adam(rate),
+        DistillConfig(
+            hidden_size=settings.hidden_size,
+            num_trials=settings.num_trials,
+            horizon=settings.horizon,
+            num_updates=settings.num_updates,
+            capacity=min(plans, DistillConfig.capacity),
+        ),
+        robot.space,
+        obs_size=parts.model.obs_size,
+        action_low=robot.env.action_low,
+        action_high=robot.env.action_high,
+        num_members=parts.model.num_members,
+        goals=family(robot, len(tasks.names)),
+        terminal_fn=imagined_end(robot.env),
+    )
+
+
+def family(robot: Robot, count: int) -> Goals:
+    """Returns what is drawn for a trial of any of `count` tasks, and seen of it.
+
+    A task that is a number among several is seen as which of them it is.
+    """
+    own, every = critic.goals(robot), len(robot.tasks.names)
+    form = jax.tree.structure(robot.tasks.params)
+
+    def draw(tasks: Any, key: Array) -> Any:
+        which, rest = jax.random.split(key)
+        i = jax.random.randint(which, (), 0, count)
+        return own.draw(jax.tree.map(lambda x: x[i], tasks), rest)
+
+    def shown(x: Array) -> Array:
+        if jnp.issubdtype(x.dtype, jnp.integer):
+            return jax.nn.one_hot(x, every, dtype=jnp.float32).ravel()
+        return jnp.ravel(x).astype(jnp.float32)
+
+    def features(data: Any) -> Array:
+        task = data if jax.tree.structure(data) == form else data.task
+        leaves = [shown(jnp.asarray(x)) for x in jax.tree.leaves(task)]
+        return jnp.concatenate([*leaves, own.features(data)])
+
+    return Goals(draw, features)
+
+
+def export(
+    run: RunFolder, config: Config, parts: Parts, networks: ActorCriticParams
+) -> None:
+    """Writes the policies `[S]` for others, and for programs without JAX if it can."""
+    env, space = parts.robot.env, parts.robot.space
+    built: Any = {
+        "obs_size": parts.model.obs_size,
+        "action_low": env.action_low,
+        "action_high": env.action_high,
+    }
+    for i, seed in enumerate(config.seeds):
+        name = f"policy-{seed}"
+        params = jax.tree.map(operator.itemgetter(i), networks)
+        save = functools.partial(save_policy, params=params, space=space, **built)
+        run.export(f"{name}.safetensors", save)
+        try:
+            content = to_onnx(params, space, **built)
+        except (ImportError, ValueError) as error:
+            run.say(f"no {name}.onnx: {error}")
+            continue
+        run.export(f"{name}.onnx", functools.partial(_write, content))
+
+
+def _write(content: bytes, target: Path) -> None:
+    target.write_bytes(content)

@@ -1,0 +1,126 @@
+"""A policy as one file, which whoever reads it need not trust."""
+
+import os
+from collections.abc import Mapping
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxpets._src import dataset, file_facts, tensor_file
+from jaxpets._src.action_box import ActionBox, action_box
+from jaxpets._src.actor_critic_networks import Networks, build_networks
+from jaxpets._src.actor_critic_records import ActorCriticParams, Goals
+from jaxpets._src.checks import check_count, check_record
+from jaxpets._src.types import ModelSpace, Planner
+
+_KIND = "policy"
+_NO_GOALS = Goals()
+
+
+def save_policy(
+    path: str | os.PathLike[str],
+    params: ActorCriticParams,
+    space: ModelSpace,
+    *,
+    obs_size: int,
+    action_low: ArrayLike,
+    action_high: ArrayLike,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Writes a policy of `distill` or `policies.actor_critic` to one file.
+
+    It holds arrays and JSON in the format of safetensors, nothing that is run.
+
+    Args:
+      path: of the file, by custom `*.safetensors`; one that is there is replaced.
+      params: of the policy.
+      space: that it was built with; functions of your own are not saved.
+      obs_size: D, likewise.
+      action_low: `[A]`, likewise.
+      action_high: `[A]`.
+      about: anything else that JSON can hold.
+
+    Raises:
+      TypeError, ValueError: if an argument is not what it should be, or has NaN.
+    """
+    check_record("params", params, ActorCriticParams)
+    check_record("space", space, ModelSpace)
+    check_count("obs_size", obs_size)
+    box = action_box(action_low, action_high)
+    arrays = {name: np.asarray(x) for name, x in tensor_file.named(params).items()}
+    file_facts.check_no_nan("params", arrays)
+    facts = {
+        "space": file_facts.space_to_json(space),
+        "obs_size": obs_size,
+        "action_low": np.asarray(box.low).tolist(),
+        "action_high": np.asarray(box.high).tolist(),
+    }
+    texts = {_KIND: facts, "about": dict(about or {})}
+    tensor_file.write(path, arrays, file_facts.metadata(_KIND, texts))
+
+
+def load_policy(
+    path: str | os.PathLike[str],
+    *,
+    goals: Goals = _NO_GOALS,
+    space: ModelSpace | None = None,
+) -> tuple[Planner, ActorCriticParams]:
+    """Reads a policy that `save_policy` wrote; a stranger's file is read or refused.
+
+    Args:
+      path: of the file.
+      goals: that it was built with; a file cannot hold its functions.
+      space: likewise, of one whose features are functions of your own.
+
+    Returns:
+      A Planner that acts by the policy, whose `PlanParams.reward` is Guided, and its
+      params.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: naming what is wrong with it.
+    """
+    check_record("goals", goals, Goals)
+    file = tensor_file.read(path)
+    file_facts.check_format(file, _KIND)
+    facts = file_facts.object_of(file, _KIND)
+    names = ("space", "obs_size", "action_low", "action_high")
+    file_facts.check_keys(file, _KIND, facts, names)
+    try:
+        check_count("obs_size", facts["obs_size"])
+        bounds = (np.asarray(facts[name], np.float32) for name in names[2:])
+        box = action_box(*bounds)
+    except (TypeError, ValueError) as error:
+        file_facts.refuse(file, str(error), error)
+    space = space or file_facts.space_from_json(file, facts["space"], facts["obs_size"])
+    first = file.shapes.get("actor.params.Dense_0.kernel", ())
+    if len(first) != 2 or 0 in first:
+        file_facts.refuse(file, f"its first layer must be of two axes, got {first}")
+    networks = build_networks(first[1], space, goals, box)
+    template = _template(networks, space, facts["obs_size"], box, first[0])
+    wanted = {name: x.shape for name, x in tensor_file.named(template).items()}
+    file_facts.check_arrays(file, wanted)
+    arrays = file.arrays()
+    file_facts.check_no_nan(str(file.path), arrays)
+    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    structure = cast(Any, jax.tree.structure(template))
+    return networks.policy, cast(
+        ActorCriticParams, jax.tree.unflatten(structure, leaves)
+    )
+
+
+def _template(
+    networks: Networks, space: ModelSpace, obs_size: int, box: ActionBox, seen: int
+) -> ActorCriticParams:
+    """Returns the params of a policy that sees so many numbers, as shapes."""
+
+    def params() -> ActorCriticParams:
+        nothing = dataset.init(1, obs_size, box.center.shape[0])
+        features = space.features(nothing.data.obs).shape[1]
+        goal = jnp.zeros((1, max(seen - features, 0)), jnp.float32)
+        return networks.init(jax.random.key(0), goal, nothing)
+
+    return jax.eval_shape(params)

@@ -1,0 +1,91 @@
+"""A policy distilled from a planner, in whole runs of the preset smoke."""
+
+import jax
+import numpy as np
+import pytest
+import runs
+
+from experiments import policy, robots
+from experiments.run import main
+from experiments.storage import rundir
+from jaxpets.policies import load_policy
+
+PHASE = ("--phase", "distill", "--task", "forward,front-flip")
+FOLDER = "distill-003-forward-front-flip"
+
+
+@pytest.fixture(scope="module")
+def explored(explored_copy):
+    return explored_copy(0, 7)
+
+
+def distilled(explored, capsys, *flags):
+    """Distills, and returns what was said."""
+    assert main([*PHASE, "--from", str(explored), *flags]) == 0
+    return capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_policy_performs_beside_its_planner(explored, capsys):
+    refit = ("--refit.num-epochs", "1", "--refit.batch-size", "16", "--tag", "refit")
+    said = distilled(explored, capsys, *refit)
+    assert "refit: 1 epochs" in said and "distill 2/2  off the planner by" in said
+    folder = explored / f"{FOLDER}-refit"
+    rows = runs.rows(folder)
+    assert [(row["planner"], row["trial"]) for row in rows] == (
+        [("plan", 1)] * 4 + [("policy", 2)] * 4 + [("both", 3)] * 4
+    )
+    assert {(row["seed"], row["task"]) for row in rows} == {
+        (seed, task) for seed in (0, 7) for task in ("forward", "front-flip")
+    }
+    assert "policy" in said and "planner" in said
+    # What acted is what was saved, and what programs without JAX get.
+    paths = np.load(folder / "trajectories.npz")
+    seen, acted = paths["obs"][:, :, 0, :-1], paths["action"][:, :, 0, 1:]
+    assert np.ptp(acted[0] - acted[1]) > 1e-3  # seeds have networks of their own
+    assert load_policy(folder / "policy-7.safetensors")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    goal = [[1.0, 0.0, 0.1], [0.0, 1.0, 0.1]]
+    for i, seed in enumerate((0, 7)):
+        session = onnxruntime.InferenceSession(folder / f"policy-{seed}.onnx")
+        for k in (0, 1):
+            tasks = np.tile(np.float32(goal[k]), (len(seen[i, k]), 1))
+            (found,) = session.run(None, {"obs": seen[i, k], "task": tasks})
+            np.testing.assert_allclose(found, acted[i, k], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_stopped_run_performs_with_what_it_had_learned(explored, capsys):
+    assert "distilled 48 plans" in distilled(explored, capsys)
+    folder = explored / FOLDER
+    before = runs.rows(folder)
+    assert "already complete" in distilled(explored, capsys)
+    (folder / "metrics.jsonl").unlink()
+    assert "distilled 48 plans" not in distilled(explored, capsys)
+    assert runs.rows(folder) == before
+
+
+def test_a_task_is_seen_by_its_weights_or_as_one_of_several():
+    cheetah = robots.named(rundir.HALF_CHEETAH, "mujoco")
+    reacher = robots.named("dmc/reacher", "mujoco")
+    for robot, size in ((cheetah, 3), (reacher, len(reacher.tasks.names) + 2)):
+        goals = policy.family(robot, len(robot.tasks.names))
+        drawn = [goals.draw(robot.tasks.params, jax.random.key(i)) for i in range(20)]
+        seen = np.stack([goals.features(x) for x in drawn])
+        assert seen.shape == (20, size) and seen.dtype == np.float32
+        assert len(np.unique(seen[:, : size - 2], axis=0)) > 1
+    assert set(np.unique(seen[:, :-2])) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--critic.num-updates", "5"), "--critic.num-updates 5 is not valid"),
+        (("--distill.num-rounds", "0"), "--distill.num-rounds 0 is not valid"),
+    ],
+    ids=["critic", "rounds"],
+)
+def test_what_cannot_be_is_refused(explored, capsys, flags, words):
+    assert main([*PHASE, *flags, "--from", str(explored), "--tag", "refused"]) == 2
+    assert words in capsys.readouterr().err
+    assert not list(explored.glob("*refused"))

@@ -1,0 +1,98 @@
+"""A policy as a file: what was saved comes back, and what was not is refused."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
+from test_policy_onnx import BOX, SPACES, policy_of
+
+import jaxpets
+from jaxpets import PlanParams, policies
+
+GOALS = policies.Goals(features=lambda target: jnp.stack([target, -target]))
+SPACE, SIZE = SPACES["turning"]
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return policy_of(SPACE, SIZE, GOALS)
+
+
+@pytest.fixture(scope="module")
+def saved(policy, tmp_path_factory):
+    path = tmp_path_factory.mktemp("policies") / "p.safetensors"
+    policies.save_policy(path, policy[1], SPACE, obs_size=SIZE, about={"a": 1}, **BOX)
+    return path
+
+
+def act(planner, params, obs):
+    known = PlanParams((), policies.Guided(jnp.float32(0.3), params))
+    plan, _ = jax.jit(planner.step)(known, jax.random.key(0), (), obs)
+    return plan.action, plan.value
+
+
+def test_what_was_saved_acts_the_same(policy, saved):
+    planner, params, obs = policy
+    again, found = policies.load_policy(saved, goals=GOALS)
+    for got, want in zip(
+        act(again, found, obs[0]), act(planner, params, obs[0]), strict=True
+    ):
+        np.testing.assert_array_equal(got, want)
+
+
+def test_own_functions_are_not_saved(policy, tmp_path):
+    planner, params, obs = policy
+    own = SPACE._replace(coordinates=())
+    policies.save_policy(tmp_path / "p", params, own, obs_size=SIZE, **BOX)
+    with pytest.raises(ValueError, match="author's own functions, which a file cannot"):
+        policies.load_policy(tmp_path / "p", goals=GOALS)
+    again, found = policies.load_policy(tmp_path / "p", goals=GOALS, space=own)
+    got, want = act(again, found, obs[0]), act(planner, params, obs[0])
+    np.testing.assert_array_equal(got[0], want[0])
+
+
+def test_numbers_that_are_none_are_not_saved(policy, tmp_path):
+    bad = policy[1]._replace(mean=policy[1].mean * jnp.nan)
+    with pytest.raises(ValueError, match="mean of params must have no NaN"):
+        policies.save_policy(tmp_path / "p", bad, SPACE, obs_size=SIZE, **BOX)
+    assert not (tmp_path / "p").exists()
+
+
+def changed(saved, path, drop=(), **changes):
+    """Writes a file that is like the saved one but for some of its parts."""
+    with safe_open(saved, "np") as file:
+        texts = dict(file.metadata())
+    texts["policy"] = json.dumps(json.loads(texts["policy"]) | changes)
+    arrays = {k: v for k, v in load_file(saved).items() if k not in drop}
+    save_file(arrays, path, texts)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (dict(x=1), "its policy must have space, obs_size"),
+        (dict(obs_size=-1), "obs_size must be at least 1, got -1"),
+        (dict(space="delta", obs_size=10**15), "must be of shape"),
+        (dict(obs_size=3), "its space must have 3 entries, got 12"),
+        (dict(action_low=["no", "number"]), "is no file that can be read"),
+        (dict(action_low=[3.0, 3.0]), "finite with low < high"),
+        (dict(action_low=[-1.0], action_high=[1.0]), "must be of shape"),
+        (dict(drop="mean"), "mean must be of shape"),
+        (dict(drop="actor.params.Dense_0.kernel"), "first layer must be of two axes"),
+    ],
+)
+def test_a_strangers_file_is_refused(saved, tmp_path, changes, words):
+    path = changed(saved, tmp_path / "p", **changes)
+    with pytest.raises(ValueError, match=words) as caught:
+        policies.load_policy(path, goals=GOALS)
+    assert str(path) in str(caught.value)
+
+
+def test_a_model_is_no_policy():
+    with pytest.raises(ValueError, match="no format 'jaxpets policy'"):
+        policies.load_policy(jaxpets.models.path("best"))
