@@ -1,9 +1,9 @@
 """Today's rows beside the committed ones, both in units of the plain XLA program.
 
 Machines of one kind differ by some per cent, and so do days. What is compared is how
-often a program runs while the plan by the scan, in bf16 and of one seed, runs once in
-the same process; of both the fastest run, since a call that is waited for wakes late
-on some days.
+often a program runs while the plan by the scan, in bf16 and of one seed, runs once: the
+last before it on such a device, in `benchmarks.all` one of the same process. Of both
+the fastest run counts, as a call that is waited for wakes late on some days.
 """
 
 import json
@@ -52,7 +52,7 @@ def report(today: Sequence[Row], folder: Path = RESULTS) -> list[Row]:
     """Prints today's rows beside those in a folder, then the plans of other systems.
 
     Returns:
-      The rows that are slower than a tenth less than what is committed.
+      The rows whose speed is below nine tenths of the committed one.
     """
     lines = [
         json.loads(line)
@@ -75,13 +75,13 @@ def report(today: Sequence[Row], folder: Path = RESULTS) -> list[Row]:
 
 
 def _with_unit(rows: Iterable[Row]) -> Iterator[tuple[Row, float | None]]:
-    """Yields each row that has a time with the last time of the plain program."""
-    unit = None
+    """Yields each row that has a time with the plain program's, on that device."""
+    units: dict[str, float] = {}
     for row in rows:
         if "min_ms" in row:
             if row["benchmark"] == "plan" and _UNIT.items() <= row["sizes"].items():
-                unit = row["min_ms"]
-            yield row, unit
+                units[row["device"]] = row["min_ms"]
+            yield row, units.get(row["device"])
 
 
 def _key(row: Row) -> str:

@@ -32,7 +32,7 @@ from .parallel.devices import AXES, SEED, TASK, Placement
 from .phases import placed, say_rollout
 from .policy import export, make_distiller
 from .progress import Progress, Watch
-from .refit import refit
+from .refit import refitted
 from .storage import rundir
 from .storage.folder import RunFolder
 
@@ -80,7 +80,9 @@ def distill(
     parts = build(config)
     say_rollout(run, parts.performed_by)
     turns = config.distill.num_rounds
-    progress = Progress((turns + 2) * config.task_length, 0, "distill", watch)
+    learned_before = bool(run.steps())
+    length = (3 if learned_before else turns + 2) * config.task_length
+    progress = Progress(length, 0, "distill", watch)
     placement, horizon = placed(run, len(config.seeds)), config.task_planner.horizon
     distiller = make_distiller(config, parts, tasks)
 
@@ -151,7 +153,7 @@ def _explored(now: _Run, source: RunFolder) -> State:
 
     state = source.restore_trial(now.step, form, part=True)
     if parts.refitter:
-        state = refit(config, parts, state, now.step, now.folder)
+        state = refitted(config, parts, state, source, now.step, now.folder)
     return state
 
 
@@ -169,9 +171,11 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
         donate_argnums=2,
     )  # fmt: skip
     dataset = append(dataset, place(planned.transitions, SEED))
-    learned = init(params, place(now.keys(0), SEED), dataset)
+    # With the keys of a place that no task has: those of tasks are for trials.
+    apart = [len(now.parts.robot.tasks.names)]
+    learned = init(params, place(now.keys(0, apart)[..., 0], SEED), dataset)
     for turn in range(1, settings.num_rounds + 1):
-        keys, _ = acting.split_keys(now.keys(turn))
+        keys = now.keys(turn, apart)[..., 0]
         learned, metrics = learn(params, place(keys, SEED), learned, dataset)
         metrics = devices.collect(now.placement, jax.block_until_ready(metrics), SEED)
         error, skipped = (
@@ -287,7 +291,7 @@ def _summary(rows: list[dict[str, Any]], names: Sequence[str], seconds: float) -
         planner, *others = (found[name] for found in means)
         shown = [f"{WHO[0]} {planner:6.0f}"]
         for who, mean in zip(WHO[1:], others, strict=True):
-            share = f" ({mean / planner:.0%})" * (planner > 0)
+            share = f" ({mean / planner:.0%})" if planner > 0 else ""
             shown.append(f"{who} {mean:6.0f}{share}")
         lines.append(f"  {name:11} {'  '.join(shown)}")
     return "\n".join(lines)

@@ -121,8 +121,8 @@ def _phase(later: Flags) -> list[str]:
     phase = flags.pop("phase", None)
     if phase not in ("zero-shot", "finetune", "distill"):
         raise UsageError(
-            f"then.phase {printable(repr(phase))} is not valid; it must be zero-shot "
-            "or finetune."
+            f"then.phase {printable(repr(phase))} is not valid; it must be zero-shot, "
+            "finetune or distill."
         )
     return [str(phase), *_line(flags)]
 

@@ -4,7 +4,6 @@ The reward of a task is first read here. What is learned is saved with the model
 performs, so that a run that was stopped goes on.
 """
 
-import contextlib
 import time
 from typing import Any
 
@@ -20,11 +19,9 @@ from jaxpets.policies import ActorCriticParams
 from . import acting, critic, exploration, robots
 from .build import CRITIC, Parts, State, key_per, trial_keys
 from .config import Config
-from .entries import to_json
-from .errors import CheckpointError
 from .parallel import devices
 from .parallel.devices import SEED, TASK
-from .refit import refit
+from .refit import refitted
 from .storage.folder import RunFolder
 
 # Which axes seeds and tasks have: of PlanParams, of data, and of all else.
@@ -56,7 +53,7 @@ def prepared(
     if parts.refitter or parts.critic:
         state = source.restore_trial(step, exploration.as_saved(config, parts))
         if parts.refitter:
-            state = _refitted(config, parts, state, source, step, run)
+            state = refitted(config, parts, state, source, step, run)
         model = exploration.model_of(state)
         if parts.critic:
             networks = _learned(config, parts, tasks, state, step, run)
@@ -65,21 +62,6 @@ def prepared(
         model = source.restore_trial(step, form, part=True)
     run.save(step, model)
     return model
-
-
-def _refitted(
-    config: Config, parts: Parts, state: State, source: RunFolder, step: int,
-    run: RunFolder,
-) -> State:  # fmt: skip
-    """Returns the learner after its refit; that of another variant is the same one."""
-    form, wanted = exploration.model_of(state), to_json(config)["refit"]
-    for other in source.below(f"{config.phase}-{step:03d}*"):
-        if other.path != run.path and other.config().get("refit") == wanted:
-            with contextlib.suppress(CheckpointError):  # damaged: it is made again
-                if found := other.restore(form, part=True):
-                    run.say(f"refit: as in {other.path.name}")
-                    return state._replace(params=found[1].params)
-    return refit(config, parts, state, step, run)
 
 
 def template(config: Config, parts: Parts, tasks: Tasks) -> State:

@@ -5,17 +5,53 @@ is enough to go on exploring; for performing a task the last steps leave noise i
 weights, and what came late was shown a few times only.
 """
 
+import contextlib
 import time
 
 import jax
 from jax import Array
 
-from . import loop
+from . import exploration, loop
 from .build import REFIT, Parts, State, trial_keys
 from .config import Config
+from .entries import to_json
+from .errors import CheckpointError
 from .parallel import devices
 from .parallel.devices import SEED
+from .storage import rundir
 from .storage.folder import RunFolder
+
+# What two variants of zero-shot must have in common for their refits to be one.
+_SAME = (
+    "refit", "env", "arm", "seeds", "engine", "random_trials", "trial_length",
+    "num_bits", "model", "training", "planner",
+)  # fmt: skip
+
+
+def refitted(
+    config: Config, parts: Parts, state: State, source: RunFolder, step: int,
+    run: RunFolder,
+) -> State:  # fmt: skip
+    """Returns what `refit` does, from another zero-shot of the run if one has it.
+
+    Args:
+      config: as of `refit`.
+      parts: likewise.
+      state: likewise.
+      source: the run that explored.
+      step: trials behind the model.
+      run: the folder of this phase.
+    """
+    form, own = exploration.model_of(state), to_json(config)
+    for other in source.below(f"zero-shot-{step:03d}*"):
+        with contextlib.suppress(CheckpointError):  # damaged: it is made again
+            then = other.find_json(rundir.CONFIG)
+            if other.path != run.path and all(then.get(x) == own[x] for x in _SAME):
+                found = other.restore(form, part=True)
+                if found and found[0] == step:
+                    run.say(f"refit: as in {other.path.name}")
+                    return state._replace(params=found[1].params)
+    return refit(config, parts, state, step, run)
 
 
 def refit(

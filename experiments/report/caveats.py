@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config import Config, Evaluation, Exploration, Mark, Tuning
+from ..config import Config, Evaluation, Exploration, Mark, Science, Tuning
 from ..entries import entries
 from ..storage import rundir
 from .logs import Row, Scores, number
@@ -18,6 +18,7 @@ _DEPENDS_ON = {
     "explore": (Exploration,),
     "zero-shot": (Exploration, Evaluation),
     "finetune": (Exploration, Evaluation, Tuning),
+    "distill": (Science,),
 }
 
 
@@ -111,7 +112,7 @@ def _missing(rows: Sequence[Row], found: Scores, explored: int) -> Iterator[str]
 def _not_finite(rows: Sequence[Row]) -> Iterator[str]:
     """Counts the returns that the tables leave out."""
     for arm in in_order({row.arm for row in rows}):
-        for phase in ("explore", "zero-shot", "finetune"):
+        for phase in _DEPENDS_ON:
             own = [r.data for r in rows if (r.arm, r.phase) == (arm, phase)]
             if phase == "explore":
                 values = [

@@ -19,7 +19,6 @@ import numpy as np
 from .. import calling, signals
 from ..errors import RunError, UsageError, last_line, storage_errors
 from ..report import logs, stats, tables
-from ..report.logs import Scores
 from ..storage import rundir
 from ..storage.metrics import Row, number
 from . import suite
@@ -165,38 +164,53 @@ def _mean(values: Iterable[float | None]) -> str:
 
 
 def _iqm(of_tasks: Sequence[Mapping[str, Any]]) -> str:
-    """Returns the interquartile mean of the scores of tasks that have equal seeds."""
-    if not of_tasks:
+    """Returns the interquartile mean of scores, over seeds that performed all tasks."""
+    scores = np.array(list(_by_seed(of_tasks).values())).T if of_tasks else np.empty(0)
+    if not scores.size:
         return "-"
-    scores = _scores(of_tasks)
     low, high = stats.stratified_interval(scores)
     return f"{float(stats.iqm(scores.reshape(-1))):.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _scores(of_tasks: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """Returns scores `[K, S]` of the seeds that performed all K tasks."""
-    seeds = sorted(set.intersection(*(set(x["score"]) for x in of_tasks)), key=int)
-    return np.array([[x["score"][seed] for seed in seeds] for x in of_tasks])
+def _by_seed(of_tasks: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """Returns the scores of all tasks by seed, of seeds of which all are finite."""
+    seeds = set.intersection(*(set(x["score"]) for x in of_tasks))
+    every = {seed: [x["score"][seed] for x in of_tasks] for seed in sorted(seeds)}
+    return {seed: scores for seed, scores in every.items() if np.isfinite(scores).all()}
 
 
 def _effects(found: Results) -> list[str]:
-    """Returns differences of a seed's mean score over tasks between two variants."""
-    scores: Scores = {}
-    for tag, by_arm in found.items():
-        for arm, by_task in by_arm.items():
-            tasks = [x for name, x in by_task.items() if name != UPRIGHT]
-            of_seeds = 100.0 * _scores(tasks).mean(axis=0)
-            scores.setdefault(f"{arm}, {tag}", {})["score, %"] = dict(
-                enumerate(of_seeds.tolist())
-            )
+    """Returns differences of a seed's mean score over tasks between two variants.
+
+    The two have their model in common, so a seed's difference is one number.
+    """
     arms = tables.in_order({arm for by_arm in found.values() for arm in by_arm})
-    pairs = [
-        (f"{arm}, {one}", f"{arm}, {other}")
-        for arm in arms
-        for other, one in itertools.combinations(found, 2)
-        if _one_apart(one, other) and arm in found[one] and arm in found[other]
-    ]
-    return tables.differences(["score, %"], scores, pairs)
+    lines = []
+    for arm in arms:
+        for other, one in itertools.combinations(found, 2):
+            if _one_apart(one, other) and arm in found[one] and arm in found[other]:
+                ours, theirs = (_tasks_of(found[tag][arm]) for tag in (one, other))
+                gaps = 100.0 * np.array(
+                    [
+                        np.mean(ours[seed]) - np.mean(theirs[seed])
+                        for seed in ours
+                        if seed in theirs
+                    ]
+                )
+                lines.append([f"`{arm}`", one, other, _difference(gaps)])
+    return tables.table(["arm", "variant", "less", "score, %"], lines)
+
+
+def _tasks_of(by_task: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float]]:
+    return _by_seed([x for name, x in by_task.items() if name != UPRIGHT])
+
+
+def _difference(gaps: np.ndarray) -> str:
+    if not len(gaps):
+        return "-"
+    interval = stats.t_interval(gaps)
+    beside = f" [{interval[0]:.0f}, {interval[1]:.0f}]" if interval else ""
+    return f"{gaps.mean():.0f}{beside}"
 
 
 def _one_apart(one: str, other: str) -> bool:

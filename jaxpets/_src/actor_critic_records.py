@@ -74,8 +74,8 @@ class ActorCriticParams(NamedTuple):
     Attributes:
       actor: Flax parameters.
       critics: Flax parameters of two critics; every leaf starts with 2.
-      mean: `[F]`, of the features of observations.
-      std: `[F]`.
+      mean: `[F + G]`, of the features of observations and goals.
+      std: `[F + G]`.
       scale: `[]`, what a value is multiplied by before the critics see it.
     """
 

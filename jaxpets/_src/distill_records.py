@@ -22,8 +22,9 @@ class DistillConfig:
       capacity: plans that are kept to learn from, at least; the oldest are replaced.
       num_updates: gradient steps per call.
       batch_size: plans per gradient step.
-      planned: share of the trials in which the planner acts; in the others the policy
-        does, so that the planner is asked about the states that the policy leads to.
+      planned: share of the trials in which the planner acts, of a member's trials
+        rounded up; in the others the policy does, so that the planner is asked about
+        the states that the policy leads to.
       noise: standard deviation of the noise on imagined actions, in half widths of the
         box; every trial draws its share of it.
       restart: chance that an imagined trial begins anew, per step.

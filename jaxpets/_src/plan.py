@@ -86,8 +86,9 @@ def plan(
         None: nothing.
       propose_fn: `(PlanParams, key, obs) -> actions [H, A]` in the box, as a policy
         would go on; see `policies.prior`. The search begins at it where it promises
-        more than the last plan, and so never at less. Its state must have a `mean`, as
-        those of `jaxpets.optimizers` have.
+        more than the last plan, by what each is imagined to return once. Its state
+        must have a `mean`, as those of `jaxpets.optimizers` have. CEM draws no wider
+        than to the edge of the box: it needs proposals that lie inside.
 
     Returns:
       A Planner.

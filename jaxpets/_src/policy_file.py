@@ -13,7 +13,7 @@ from jaxpets._src import dataset, file_facts, tensor_file
 from jaxpets._src.action_box import ActionBox, action_box
 from jaxpets._src.actor_critic_networks import Networks, build_networks
 from jaxpets._src.actor_critic_records import ActorCriticParams, Goals
-from jaxpets._src.checks import check_count, check_record
+from jaxpets._src.checks import check_count, check_like, check_record
 from jaxpets._src.types import ModelSpace, Planner
 
 _KIND = "policy"
@@ -50,6 +50,10 @@ def save_policy(
     check_record("space", space, ModelSpace)
     check_count("obs_size", obs_size)
     box = action_box(action_low, action_high)
+    kernel = params.actor["params"]["Dense_0"]["kernel"]  # [F + G, hidden]
+    networks = build_networks(kernel.shape[-1], space, _NO_GOALS, box)
+    template = _template(networks, space, obs_size, box, kernel.shape[0])
+    check_like("params", params, template)
     arrays = {name: np.asarray(x) for name, x in tensor_file.named(params).items()}
     file_facts.check_no_nan("params", arrays)
     facts = {
@@ -81,9 +85,12 @@ def load_policy(
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: naming what is wrong with it.
+      TypeError: if goals or space are something else.
+      ValueError: naming what is wrong with the file.
     """
     check_record("goals", goals, Goals)
+    if space is not None:
+        check_record("space", space, ModelSpace)
     file = tensor_file.read(path)
     file_facts.check_format(file, _KIND)
     facts = file_facts.object_of(file, _KIND)
@@ -93,7 +100,7 @@ def load_policy(
         check_count("obs_size", facts["obs_size"])
         bounds = (np.asarray(facts[name], np.float32) for name in names[2:])
         box = action_box(*bounds)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         file_facts.refuse(file, str(error), error)
     space = space or file_facts.space_from_json(file, facts["space"], facts["obs_size"])
     first = file.shapes.get("actor.params.Dense_0.kernel", ())

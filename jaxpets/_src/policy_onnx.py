@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxpets._src.action_box import action_box
 from jaxpets._src.actor_critic_networks import CLIP
 from jaxpets._src.actor_critic_records import ActorCriticParams
-from jaxpets._src.checks import check_count, check_record
+from jaxpets._src.checks import check_array, check_count, check_record
 from jaxpets._src.ensemble import delta_space
 from jaxpets._src.network import NORM_EPSILON
 from jaxpets._src.types import Coordinate, ModelSpace
@@ -75,6 +75,9 @@ def to_onnx(
             f"space must have at most the {mean.shape[0]} features that the policy "
             f"reads, got {read.offset.shape[0]} of obs_size {obs_size}."
         )
+    layers: Any = params.actor["params"]
+    bias = layers["Dense_2"]["bias"]
+    check_array("the last bias of params.actor", bias, [box.center.shape[0]])
     graph = _Graph()
     parts = ["obs"]
     if read.angles:
@@ -96,7 +99,6 @@ def to_onnx(
         "Gemm", x, graph.array(matrix / std), graph.array((offset - mean) / std)
     )
     x = graph.node("Clip", x, graph.array(-CLIP), graph.array(CLIP))
-    layers: Any = params.actor["params"]
     for i in range(2):
         x = graph.dense(x, layers[f"Dense_{i}"])
         norm = layers[f"LayerNorm_{i}"]

@@ -38,6 +38,12 @@ def test_speeds_are_multiples_of_the_plain_programs_of_their_day():
     assert speeds[3] is None  # only the other device has it
 
 
+def test_a_device_has_a_plain_program_of_its_own():
+    alone = [row(4.0, "fit", "other", seeds=1)]
+    (pair,) = against.pairs(alone, [plain(10.0), *alone])
+    assert pair.committed == alone[0] and pair.speed is None
+
+
 def test_what_became_slower_is_returned_and_all_is_printed(tmp_path, capsys):
     lines = [*COMMITTED, {"benchmark": "accuracy", "device": "card", "sizes": {}}]
     rival = {"name": "rival", "device": "card", "engine": "jit", "dtype": "f32",

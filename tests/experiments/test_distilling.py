@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import runs
 
-from experiments import policy, robots
+from experiments import distilling, policy, robots
 from experiments.run import main
 from experiments.storage import rundir
 from jaxpets.policies import load_policy
@@ -63,6 +63,16 @@ def test_a_stopped_run_performs_with_what_it_had_learned(explored, capsys):
     (folder / "metrics.jsonl").unlink()
     assert "distilled 48 plans" not in distilled(explored, capsys)
     assert runs.rows(folder) == before
+
+
+def test_a_planner_that_earns_nothing_has_no_share():
+    """As with a sparse reward; the run is complete all the same."""
+    rows = [
+        {"planner": who, "task": "hop", "return": value}
+        for who, value in zip(distilling.WHO, (0.0, 3.0, 0.0), strict=True)
+    ]
+    text = distilling._summary(rows, ["hop"], 1.0)
+    assert "%" not in text and "policy      3" in text
 
 
 def test_a_task_is_seen_by_its_weights_or_as_one_of_several():

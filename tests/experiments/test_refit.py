@@ -103,6 +103,18 @@ def test_a_variant_takes_the_refit_of_another(performed, explored, tmp_path, cap
     config = cli.parse(command)
     wanted, found = model(performed, config), model(again / f"{TASK}-pessimist", config)
     jax.tree.map(np.testing.assert_array_equal, found, wanted)
+    # Nor is that of another exploration, were the folder used anew.
+    copy = tmp_path / "other" / runs.NAME
+    shutil.copytree(again, copy)
+    for folder in copy.glob("zero-shot-*"):
+        config_file = folder / "config.json"
+        text = config_file.read_text().replace(
+            '"random_trials": 1', '"random_trials": 2'
+        )
+        config_file.write_text(text)
+    flags = ["--phase", "zero-shot", "--from", str(copy), *FLAGS, "--tag", "anew"]
+    assert main(flags) == 0
+    assert SAID in capsys.readouterr().err
     # A damaged one is not used, and costs the time of a refit.
     for folder in (again / TASK, again / f"{TASK}-pessimist"):
         for file in (folder / "checkpoints").rglob("d/*"):

@@ -220,6 +220,18 @@ def test_report_says_what_is_missing(plain, out):
     assert "on forward, backward, front-flip, back-flip." in text
 
 
+def test_a_policy_beside_is_no_score_and_is_missed_where_it_is_not_finite(tmp_path):
+    run = write_arm(tmp_path, "epistemic", [1.0])
+    rows = [
+        {**row, "phase": "distill", "planner": "policy", "return": None}
+        for row in zero_shot_rows("epistemic", [1.0])
+    ]
+    config = {"arm": "epistemic", "num_trials": EXPLORED, "phase": "distill"}
+    write_run(run / f"distill-{EXPLORED:03d}", rows, **config)
+    _, text = report_in(tmp_path)
+    assert "8 of 8 returns of distill are not finite" in text
+
+
 def test_exploration_alone_makes_a_report(tmp_path):
     write_run(
         tmp_path / "a", explore_rows("random", [0]), phase="explore", arm="random"
