@@ -20,7 +20,6 @@ from jaxpets._src.actor_critic_records import (
 )
 from jaxpets._src.actor_critic_update import build_update
 from jaxpets._src.checks import (
-    check_callable,
     check_count,
     check_record,
 )
@@ -95,15 +94,10 @@ def actor_critic(
     Raises:
       TypeError, ValueError: if an argument is not what it should be.
     """
-    check_callable("dynamics_fn", dynamics_fn)
     check_optimizer(optimizer)
     check_record("config", config, ActorCriticConfig)
-    check_record("space", space, ModelSpace)
-    check_record("goals", goals, Goals)
     check_count("obs_size", obs_size)
     check_count("num_members", num_members)
-    if terminal_fn is not None:
-        check_callable("terminal_fn", terminal_fn)
     box = action_box(action_low, action_high)
     networks = build_networks(config.hidden_size, space, goals, box)
     learn = build_update(networks, optimizer, config, box)

@@ -48,7 +48,13 @@ class Networks(NamedTuple):
 def build_networks(
     hidden_size: int, space: ModelSpace, goals: Goals, box: ActionBox
 ) -> Networks:
-    """Builds the functions; see `actor_critic` for the arguments."""
+    """Builds the functions; see `actor_critic` for the arguments.
+
+    Raises:
+      TypeError: if space or goals are something else.
+    """
+    check_record("space", space, ModelSpace)
+    check_record("goals", goals, Goals)
     actor = Head(hidden_size, box.center.shape[0])
     critic = Head(hidden_size, 1)
     propose = cast(Callable[[Any, Array], Array], actor.apply)

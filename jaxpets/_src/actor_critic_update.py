@@ -1,7 +1,7 @@
 """One gradient step of an actor and two critics on imagined trials."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxpets._src.actor_critic_records import (
     ActorCriticState,
 )
 from jaxpets._src.fitter import Optimizer
-from jaxpets._src.guards import choose, is_finite
+from jaxpets._src.guards import guarded_step
 from jaxpets._src.imagined_trials import Imagined
 
 # Keeps the actor's outputs where its tanh has a slope.
@@ -78,15 +78,8 @@ def build_update(
         (_, value), grads = jax.value_and_grad(loss, has_aux=True)(
             old, params, goal, steps, targets
         )
-        # Optimizers of optax do not trace under strict promotion, if a caller set it.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, opt_state = optimizer.update(
-                grads, state.opt_state, cast(Any, old)
-            )
-        new = jax.tree.map(jnp.add, old, updates)
-        good = is_finite(new)
-        (actor, critics), opt_state = choose(
-            good, (new, opt_state), (old, state.opt_state)
+        (actor, critics), opt_state, good = guarded_step(
+            optimizer.update, grads, old, state.opt_state
         )
 
         def follow(slow: Array, fast: Array) -> Array:

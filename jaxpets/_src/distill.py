@@ -101,15 +101,10 @@ def distill(
     Raises:
       TypeError, ValueError: if an argument is not what it should be.
     """
-    check_callable("dynamics_fn", dynamics_fn)
     check_optimizer(optimizer)
     check_record("config", config, DistillConfig)
-    check_record("space", space, ModelSpace)
-    check_record("goals", goals, Goals)
     check_count("obs_size", obs_size)
     check_count("num_members", num_members)
-    if terminal_fn is not None:
-        check_callable("terminal_fn", terminal_fn)
     box = action_box(action_low, action_high)
     networks = build_networks(config.hidden_size, space, goals, box)
     reward, is_guided = guided_reward(reward_fn), not isinstance(planner, Planner)

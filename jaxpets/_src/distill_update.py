@@ -11,7 +11,7 @@ from jaxpets._src.actor_critic_networks import Networks
 from jaxpets._src.actor_critic_records import ActorCriticParams
 from jaxpets._src.distill_records import DistillState, Plans
 from jaxpets._src.fitter import Optimizer
-from jaxpets._src.guards import choose, is_finite
+from jaxpets._src.guards import guarded_step
 
 
 def keep(state: DistillState, plans: Plans) -> DistillState:
@@ -51,15 +51,8 @@ def build_update(
         params = state.params
         old = (params.actor, params.critics)
         grads = cast(Any, jax.grad(loss)(old, params, batch))
-        # Optimizers of optax do not trace under strict promotion, if a caller set it.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, opt_state = optimizer.update(
-                grads, state.opt_state, cast(Any, old)
-            )
-        new = jax.tree.map(jnp.add, old, updates)
-        good = is_finite(new)
-        (actor, critics), opt_state = choose(
-            good, (new, opt_state), (old, state.opt_state)
+        (actor, critics), opt_state, good = guarded_step(
+            optimizer.update, grads, old, state.opt_state
         )
         params = params._replace(actor=actor, critics=critics)
         return state._replace(params=params, opt_state=opt_state), ~good

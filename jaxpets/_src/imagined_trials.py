@@ -7,7 +7,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_key, check_record
+from jaxpets._src.checks import (
+    check_array,
+    check_callable,
+    check_key,
+    check_record,
+)
 from jaxpets._src.returns import single_reward
 from jaxpets._src.types import (
     Dataset,
@@ -64,7 +69,13 @@ def imagine(
 
     Returns:
       `(params, policy's params, key, rewards [E, B, ...], obs [E, B, D]) -> Imagined`.
+
+    Raises:
+      TypeError: if dynamics_fn or terminal_fn is no function.
     """
+    check_callable("dynamics_fn", dynamics_fn)
+    if terminal_fn is not None:
+        check_callable("terminal_fn", terminal_fn)
     one = single_reward(reward_fn)
     rewards_of = jax.vmap(jax.vmap(one))
 
