@@ -27,6 +27,7 @@ from jaxpets._src.fitter import Optimizer, check_optimizer
 from jaxpets._src.imagined_trials import (
     check_imagined,
     imagine,
+    over_trials,
     renewed,
     reward_range,
     trial_starts,
@@ -102,8 +103,7 @@ def actor_critic(
     networks = build_networks(config.hidden_size, space, goals, box)
     learn = build_update(networks, optimizer, config, box)
     rows = (num_members, -(-config.batch_size // num_members))
-    # Sizes are said, as a reward may have no data to see them by.
-    goals_of = jax.vmap(jax.vmap(goals.features, axis_size=rows[1]), axis_size=rows[0])
+    goals_of = over_trials(goals.features, rows)
 
     def explore(policy: Any, key: Array, rewards: Any, obs: Array) -> Array:
         params, noise = policy

@@ -13,7 +13,12 @@ from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
 from jaxpets._src.distill_records import DistillConfig, DistillState, Plans
 from jaxpets._src.distill_update import keep
 from jaxpets._src.elites import WORST_VALUE
-from jaxpets._src.imagined_trials import Imagined, renewed, trial_starts
+from jaxpets._src.imagined_trials import (
+    Imagined,
+    over_trials,
+    renewed,
+    trial_starts,
+)
 from jaxpets._src.types import Dataset, Planner, PlanOutput, PlanParams
 
 _OWN: Any = 0  # the axis of what every trial has
@@ -49,14 +54,6 @@ class Trials(NamedTuple):
     ask: Callable[
         [PlanParams, Dataset, Array, DistillState, Array], tuple[DistillState, Asked]
     ]
-
-
-def over_trials(
-    features: Callable[[Any], Array], rows: tuple[int, int]
-) -> Callable[[Any], Array]:
-    """Maps what networks see of a task over trials `[E, B]`."""
-    # Sizes are said, as a reward may have no data to see them by.
-    return jax.vmap(jax.vmap(features, axis_size=rows[1]), axis_size=rows[0])
 
 
 def build_trials(

@@ -125,6 +125,14 @@ def trial_starts(
     return starts
 
 
+def over_trials(
+    features: Callable[[Any], Array], rows: tuple[int, int]
+) -> Callable[[Any], Array]:
+    """Maps what networks see of a task over trials `[E, B]`."""
+    # Sizes are said, as a reward may have no data to see them by.
+    return jax.vmap(jax.vmap(features, axis_size=rows[1]), axis_size=rows[0])
+
+
 def renewed(again: Array, fresh: Any, old: Any) -> Any:
     """Returns what trials go on from: `fresh` where they begin `again`, `[E, B]`."""
 
