@@ -84,7 +84,7 @@ def _evaluated(run: Path, config: Config) -> tuple[RunFolder, int, State]:
         raise UsageError(f"{run} has not performed; run --phase zero-shot first.")
     last = max(evaluated, key=_rank)
     template = exploration.model_of(exploration.template(config, build(config)))
-    found = last.restore(template)
+    found = last.restore(template, part=True)  # without the critic, if it had one
     assert found is not None
     return last, *found
 
