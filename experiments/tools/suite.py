@@ -1,7 +1,8 @@
 """`python -m experiments.tools.suite RUNS`: the suite's twenty tasks, beside others'.
 
-Reads the zero-shot logs of `dmc/...` robots, and prints a table in Markdown: means over
-seeds and their 95 % intervals, the mean of the tasks, and what others have published.
+Reads the zero-shot logs of `dmc/...` robots, or the file of results that was made of
+them, and prints a table in Markdown: means over seeds with 95 % intervals, means of the
+tasks, and what others have published.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from ..config import Config
 from ..errors import RunError, UsageError, last_line, storage_errors
 from ..report import logs, stats, tables
 from ..storage import rundir
+from . import suite_figure
 
 # Of Plan2Explore's ten domains. A finger that spins has another damping: two robots.
 TASKS = {
@@ -34,6 +36,8 @@ TASKS = {
     "reacher": ("easy", "hard"),
     "walker": ("stand", "walk", "run"),
 }
+# On whose development seeds the settings of `dmc20.toml` were chosen.
+CHOSEN_ON = ("ball_in_cup", "cartpole", "cheetah", "pendulum", "walker")
 
 
 def _name(domain: str, task: str) -> str:
@@ -41,6 +45,12 @@ def _name(domain: str, task: str) -> str:
 
 
 NAMES = tuple(_name(domain, task) for domain in TASKS for task in TASKS[domain])
+_CHOSEN = tuple(x for x in NAMES if x.partition("/")[0] in CHOSEN_ON)
+_HALVES = {
+    "domains that settings were chosen on": _CHOSEN,
+    "the other domains": tuple(x for x in NAMES if x not in _CHOSEN),
+}
+ENDS = (0, -1)  # of others' steps: the fewest and the most
 PEERS = Path("results/dmc20-peers.json")
 Results = dict[str, dict[str, dict[str, Any]]]  # arm -> domain/task -> numbers
 
@@ -67,18 +77,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog=calling.usage("tools.suite"), description=__doc__
     )
-    parser.add_argument("runs", type=Path, help="a folder with runs below it")
+    words = "a folder with runs below it, or a file of their results"
+    parser.add_argument("runs", type=Path, help=words)
     parser.add_argument("--explored", type=int, default=100, help="exploration trials")
     parser.add_argument("--tag", default="", help="the variant of phase 2")
     parser.add_argument("--peers", type=Path, default=PEERS, help="others' numbers")
     parser.add_argument("--json", type=Path, help="file for the results")
+    parser.add_argument("--figure", type=Path, help="file for them as a figure")
     args = parser.parse_args(argv)
     try:
-        found = results(args.runs, args.explored, args.tag)
+        if args.runs.is_file():
+            found = read(args.runs)
+        else:
+            found = results(args.runs, args.explored, args.tag)
         peers = read_peers(args.peers)
         if args.json is not None:
             with storage_errors(f"write {args.json}"):
                 rundir.write_json(args.json, found)
+        if args.figure is not None:
+            with storage_errors(f"write {args.figure}"):
+                suite_figure.draw(
+                    args.figure, found, peers.returns, _labels(peers), _HALVES
+                )
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
@@ -115,24 +135,47 @@ def results(runs: Path, explored: int, tag: str) -> Results:
 def table(found: Results, peers: Peers) -> list[str]:
     """Returns the tasks as rows: our arms, then others after fewest and most steps."""
     arms = tables.in_order(found)
-    columns = [(x, i) for x in peers.systems for i in (0, -1)]
+    columns = [(x, i) for x in peers.systems for i in ENDS]
     lines = [
         [name, *(cell(found[arm].get(name)) for arm in arms)]
         + [f"{peers.returns[x.name][name][i]:.0f}" for x, i in columns]
         for name in NAMES
     ]
-    theirs = [
-        f"{statistics.mean(peers.returns[x.name][name][i] for name in NAMES):.0f}"
-        for x, i in columns
-    ]
-    lines.append(["**mean**", *(_mean(found[arm]) for arm in arms), *theirs])
-    said = [f"{x.name}, {x.steps[i] / 1e6:g}M" for x, i in columns]
+    for group, names in {"**mean**": NAMES, **_HALVES}.items():
+        theirs = [
+            f"{statistics.mean(peers.returns[x.name][name][i] for name in names):.0f}"
+            for x, i in columns
+        ]
+        lines.append([group, *(_mean(found[arm], names) for arm in arms), *theirs])
     about = [
         f"- {x.name} ({'with' if x.reward else 'without'} the reward): {x.source}. "
         f"{x.about}"
         for x in peers.systems
     ]
+    said = [_label(x, i) for x, i in columns]
     return [*tables.table(["task", *(f"`{x}`" for x in arms), *said], lines), *about]
+
+
+def _labels(peers: Peers) -> dict[tuple[str, int], str]:
+    """Returns what a figure says of a system after its fewest and its most steps."""
+    return {
+        (x.name, i): _label(x, i) + ", with the reward" * x.reward
+        for x in peers.systems
+        for i in ENDS
+    }
+
+
+def _label(system: System, i: int) -> str:
+    return f"{system.name}, {system.steps[i] / 1e6:g}M"
+
+
+def read(path: Path) -> Results:
+    """Reads a file of results.
+
+    Raises:
+      RunError: if it is not there, or is not one.
+    """
+    return _read(path, Results, "results")
 
 
 def read_peers(path: Path) -> Peers:
@@ -141,10 +184,14 @@ def read_peers(path: Path) -> Peers:
     Raises:
       RunError: if it is not there, or is not one.
     """
+    return _read(path, Peers, "numbers of others")
+
+
+def _read(path: Path, form: Any, what: str) -> Any:
     try:
-        return msgspec.convert(rundir.read_json(path), Peers)
+        return msgspec.convert(rundir.read_json(path), form)
     except msgspec.ValidationError as error:
-        raise UsageError(f"{path} has no numbers of others: {error}") from error
+        raise UsageError(f"{path} has no {what}: {error}") from error
 
 
 def _trial_steps(config: Mapping[str, Any]) -> int:
@@ -177,20 +224,23 @@ def cell(found: Mapping[str, Any] | None) -> str:
     return text
 
 
-def _mean(found: Mapping[str, Mapping[str, Any]]) -> str:
+def _mean(found: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
     """Returns the mean of tasks, and of how many if some are missing.
 
     With an interval over seeds if all tasks have the same: a seed's mean is one number.
     """
-    seeds = {frozenset(x["seeds"]) for x in found.values()}
+    own = [found[name] for name in names if name in found]
+    if not own:
+        return "-"
+    seeds = {frozenset(x["seeds"]) for x in own}
     of_seeds = [
-        statistics.mean(x["seeds"][seed] for x in found.values())
+        statistics.mean(x["seeds"][seed] for x in own)
         for seed in sorted(seeds.pop() if len(seeds) == 1 else ())
     ]
-    mean = statistics.mean(x["mean"] for x in found.values())
+    mean = statistics.mean(x["mean"] for x in own)
     interval = stats.t_interval(np.array(of_seeds))
     text = cell({"mean": mean, "interval": interval})
-    return text if len(found) == len(NAMES) else f"{text} (of {len(found)})"
+    return text if len(own) == len(names) else f"{text} (of {len(own)})"
 
 
 if __name__ == "__main__":

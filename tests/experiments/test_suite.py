@@ -9,6 +9,7 @@ from small_logs import write_run
 
 from experiments.tools import suite
 
+PEERS_FILE = Path(__file__).parents[2] / suite.PEERS
 PEERS = {
     "systems": [
         {"name": "Rival", "reward": True, "steps": [100_000, 500_000, 1_000_000],
@@ -66,6 +67,9 @@ def test_results_are_of_the_tasks_that_others_have(runs, tmp_path, peers, capsys
     assert "| walker/run | - | 10 | 31 |" in text
     # Of a seed's mean, 300 and 500: the interval is over seeds, not over tasks.
     assert "| **mean** | 400 [-871, 1671] (of 2) | 10 | 31 |" in text
+    # One of the two is of a domain that settings were chosen on.
+    assert "| domains that settings were chosen on | 600 [-671, 1871] (of 1) |" in text
+    assert "| the other domains | 200 [-1071, 1471] (of 1) | 10 | 31 |" in text
     assert "- Rival (with the reward): their page. It counts otherwise." in text
 
 
@@ -85,7 +89,7 @@ def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
 
 
 def test_the_committed_numbers_of_others_are_of_every_task():
-    peers = suite.read_peers(Path(__file__).parents[2] / suite.PEERS)
+    peers = suite.read_peers(PEERS_FILE)
     assert {x.name for x in peers.systems} == set(peers.returns)
     for system in peers.systems:
         returns = peers.returns[system.name]
@@ -93,9 +97,31 @@ def test_the_committed_numbers_of_others_are_of_every_task():
         assert all(len(x) == len(system.steps) for x in returns.values())
 
 
-def test_committed_results_are_those_of_the_committed_logs(tmp_path):
+def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
     results = Path(__file__).parents[2] / "results"
-    with tarfile.open(results / "dmc20" / "best.tar.xz") as logs:
-        logs.extractall(tmp_path, filter="data")
+    for arm in ("best", "epistemic", "random"):
+        with tarfile.open(results / "dmc20" / f"{arm}.tar.xz") as logs:
+            logs.extractall(tmp_path, filter="data")
     found = suite.results(tmp_path, 100, "")
     assert found == json.loads((results / "dmc20.json").read_text())
+    assert suite.main([str(results / "dmc20.json"), "--peers", str(PEERS_FILE)]) == 0
+    page = (results / "dmc20.md").read_text()
+    for line in capsys.readouterr().out.splitlines():
+        if line.startswith(("| **mean**", *(f"| {name}" for name in suite.NAMES))):
+            task, epistemic, random, best, *others = line.strip("| ").split(" | ")
+            assert " | ".join([task, best, epistemic, random, *others[:4]]) in page
+
+
+def test_a_figure_is_of_the_file_of_results(tmp_path, peers):
+    results = Path(__file__).parents[2] / "results" / "dmc20.json"
+    figure = tmp_path / "tasks.svg"
+    assert suite.main([str(results), "--peers", peers, "--figure", str(figure)]) == 0
+    said = figure.read_text()
+    assert all(f"<!-- {name} -->" in said for name in suite.NAMES)
+
+
+def test_a_file_that_has_no_results_is_refused(tmp_path, peers, capsys):
+    path = tmp_path / "results.json"
+    path.write_text('{"best": 3}')
+    assert suite.main([str(path), "--peers", peers]) == 2
+    assert f"{path} has no results" in capsys.readouterr().err
