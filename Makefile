@@ -28,7 +28,7 @@ results: $(VENV)/.installed
 	$(BIN)/python -m experiments.run --phase report --out results/laptop
 	cp results/paper/report/table1.json results/table1.json
 	$(BIN)/python -m experiments.report.method_figure results/method.svg
-	$(BIN)/python -m experiments.tools.card
+	$(BIN)/python -m experiments.tools.shipped
 
 test: $(VENV)/.installed
 	$(BIN)/python $(COVERAGE) -m pytest -n 2 --dist loadfile $(PYTEST_FLAGS)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from . import flags, robots, user_files
+from . import flags, model_file, robots, user_files
 from .config import (
     Basics,
     Compute,
@@ -29,9 +29,6 @@ from .validate import (
     require,
     validate,
 )
-
-# Explored models that come with the code; see `experiments.tools.pretrained`.
-PRETRAINED = Path(__file__).with_name("pretrained")
 
 
 def parse(argv: Sequence[str], source: Config | None = None) -> Config:
@@ -57,7 +54,7 @@ def parse(argv: Sequence[str], source: Config | None = None) -> Config:
             explored = dataclasses.replace(explored, critic=CriticConfig())
         config = _config(phase, rest, explored)
         check_explored(config, explored)
-        _check_pretrained(config)
+        _check_file(config)
     validate(config)
     if phase != "report":
         robots.check_tasks(config, robots.of(config))
@@ -93,11 +90,17 @@ def explored_run(config: Config) -> Path:
 
 
 def results_folder(config: Config) -> Path:
-    """Returns where later phases put theirs: the run they start from, if it is ours."""
+    """Returns where later phases put theirs: in the run they start from, if it is one.
+
+    What starts from a file of a model goes into a folder of its name.
+    """
     source = explored_run(config)
-    if source.parent != PRETRAINED.resolve():
+    if not source.is_file():
         return source
-    return config.out.resolve() / f"pretrained-{source.name}"
+    assert config.source is not None
+    name = "-".join(config.source.with_suffix("").parts)
+    shipped = config.source.parts[:1] == (model_file.PRETRAINED,)
+    return config.out.resolve() / (name if shipped else source.stem)
 
 
 def variant(config: Config, step: int) -> str:
@@ -139,13 +142,10 @@ def _config(phase: Phase, argv: Sequence[str], default: Config) -> Config:
 
 
 def _source(config: Config) -> Path:
-    """Returns a folder, or what comes with the code by the name `pretrained/NAME`."""
+    """Returns the folder of a run, or the file of a model."""
     study = rundir.study({"preset": config.preset, "env": config.env})
     name = config.name or f"{study}-{rundir.label(config.arm)}"
-    source = config.source or config.out / name
-    if source.exists() or source.parts[:1] != ("pretrained",):
-        return source
-    return PRETRAINED.joinpath(*(source.parts[1:] or ("epistemic",)))
+    return model_file.named(config.source or config.out / name)
 
 
 def _explored(config: Config) -> Config:
@@ -154,6 +154,8 @@ def _explored(config: Config) -> Config:
     They are numbers: what to call it and where to write are never another run's.
     """
     folder = _source(config)
+    if folder.is_file():
+        return _numbers(model_file.config_of(folder, config))
     path = folder / rundir.CONFIG
     if not path.is_file():
         raise CheckpointError(
@@ -175,12 +177,12 @@ def _numbers(explored: Config) -> Config:
     return Config(**vars(part(explored, Science)), **vars(part(explored, Compute)))
 
 
-def _check_pretrained(config: Config) -> None:
+def _check_file(config: Config) -> None:
     """Refuses to learn where nothing is to learn on."""
-    if explored_run(config).parent == PRETRAINED.resolve():
-        valid = "zero-shot or distill; a model that comes with the code has no data"
+    if explored_run(config).is_file():
+        valid = "zero-shot or distill; a file of a model has no data"
         require(config.phase != "finetune", "--phase", config.phase, valid)
-        valid = "0; a model that comes with the code has no data"
+        valid = "0; a file of a model has no data"
         epochs, updates = config.refit.num_epochs, config.critic.num_updates
         require(epochs == 0, "--refit.num-epochs", epochs, valid)
         require(updates == 0, "--critic.num-updates", updates, valid)

@@ -27,6 +27,7 @@ from . import acting, cost, exploration, records, robots
 from .acting import Actors, Scorer, Trials
 from .build import DISTILL, Parts, State, build, key_per, trial_keys
 from .config import Config
+from .model_file import Source
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
 from .phases import placed, say_rollout
@@ -67,7 +68,7 @@ class _Run(NamedTuple):
 
 
 def distill(
-    config: Config, source: RunFolder, run: RunFolder, step: int, watch: Watch
+    config: Config, source: Source, run: RunFolder, step: int, watch: Watch
 ) -> None:
     """Distills the planner, and performs tasks with it and with the policy."""
     robot = robots.of(config)
@@ -142,7 +143,7 @@ def _template(now: _Run) -> State:
     return exploration.model_of(explored)._replace(reward=begun.params)
 
 
-def _explored(now: _Run, source: RunFolder) -> State:
+def _explored(now: _Run, source: Source) -> State:
     """Returns the model, after a refit if one is asked for, and the data behind it."""
     config, parts = now.config, now.parts
     saved = exploration.as_saved(config, parts)

@@ -32,6 +32,7 @@ from .build import (
     trial_keys,
 )
 from .config import UNPLANNED, Config
+from .model_file import Source
 from .parallel import devices
 from .parallel.devices import SEED, TASK, Placement
 from .preparation import prepared
@@ -156,7 +157,7 @@ def explore(config: Config, run: RunFolder, watch: Watch) -> None:
 
 
 def zero_shot(
-    config: Config, source: RunFolder, run: RunFolder, step: int, watch: Watch
+    config: Config, source: Source, run: RunFolder, step: int, watch: Watch
 ) -> None:
     """Phase 2, at first: tasks planned with the explored model, nothing learned.
 
@@ -213,7 +214,7 @@ def zero_shot(
 
 
 def finetune(
-    config: Config, source: RunFolder, run: RunFolder, step: int, watch: Watch
+    config: Config, source: Source, run: RunFolder, step: int, watch: Watch
 ) -> None:
     """Phase 2, goes on: the loop of PETS with a task's reward, one branch per task.
 

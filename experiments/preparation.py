@@ -19,6 +19,7 @@ from jaxpets.policies import ActorCriticParams
 from . import acting, critic, exploration, robots
 from .build import CRITIC, Parts, State, key_per, trial_keys
 from .config import Config
+from .model_file import Source
 from .parallel import devices
 from .parallel.devices import SEED, TASK
 from .refit import refitted
@@ -32,7 +33,7 @@ _EVERY = P(SEED, TASK)
 
 
 def prepared(
-    config: Config, source: RunFolder, run: RunFolder, step: int, parts: Parts,
+    config: Config, source: Source, run: RunFolder, step: int, parts: Parts,
     tasks: Tasks,
 ) -> State:  # fmt: skip
     """Returns the model `[S]` to plan tasks with, from a stopped run or made anew.

@@ -74,9 +74,6 @@ PRESETS = {
 }
 
 
-# What models that come with the code perform with: the laptop's search, further ahead.
-PRETRAINED_PLANNER = dataclasses.replace(PRESETS["laptop"].task_planner, horizon=20)
-PRETRAINED_DISTILL = PRESETS["laptop"].distill
 # How `best` performs: a longer refit, of every member on every row, and a search from
 # fewer elites in noise that keeps its direction for a while.
 _BEST_REFIT = TrainingConfig(800, 256, final_rate=0.005, bootstrap=False)
@@ -117,3 +114,18 @@ def preset_config(preset: Preset, arm: str, env: str) -> Config:
     """Returns a preset with what an arm and a robot change of it."""
     changes = _OWN.get((preset, arm), {}) | _OWN.get((preset, env), {})
     return dataclasses.replace(PRESETS[preset], **changes)
+
+
+def quick_search(config: Config) -> PlannerConfig:
+    """Returns a search that two cores are quick enough for, of a run at any size.
+
+    That of the paper's size is replaced by the laptop's, at least 20 steps ahead.
+    """
+    if config.preset != "paper":
+        return config.task_planner
+    quick = preset_config("laptop", config.arm, config.env).task_planner
+    return dataclasses.replace(
+        quick,
+        horizon=max(quick.horizon, 20),
+        num_particles=config.model.num_members,
+    )

@@ -16,6 +16,7 @@ from .build import REFIT, Parts, State, trial_keys
 from .config import Config
 from .entries import to_json
 from .errors import CheckpointError
+from .model_file import Source
 from .parallel import devices
 from .parallel.devices import SEED
 from .storage import rundir
@@ -29,7 +30,7 @@ _SAME = (
 
 
 def refitted(
-    config: Config, parts: Parts, state: State, source: RunFolder, step: int,
+    config: Config, parts: Parts, state: State, source: Source, step: int,
     run: RunFolder,
 ) -> State:  # fmt: skip
     """Returns what `refit` does, from another zero-shot of the run if one has it.

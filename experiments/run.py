@@ -23,6 +23,7 @@ from .errors import (
     last_line,
     stop_behind,
 )
+from .model_file import ModelFile, Source
 from .parallel import distributed
 from .progress import Watch
 
@@ -86,7 +87,8 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
     from .storage.folder import RunFolder
 
     check_cpu(config)
-    source = RunFolder(cli.explored_run(config))
+    path = cli.explored_run(config)
+    source: Source = ModelFile(path) if path.is_file() else RunFolder(path)
     if config.phase == "explore":
         with _opened(config, source.path) as run:
             from . import phases
@@ -131,7 +133,7 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
         yield run
 
 
-def _explored_step(config: Config, source: "RunFolder") -> int:
+def _explored_step(config: Config, source: Source) -> int:
     """Returns the trial whose checkpoint phase 2 starts from."""
     steps = source.steps()
     if not steps:

@@ -1,22 +1,15 @@
 """What a page is about: a robot, a model of it, and the search that plans with it."""
 
-import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import msgspec
+from typing import NamedTuple
 
 import jaxpets
-from jaxpets import models
 from jaxpets.envs import Robot
 
-from .. import build, exploration, robots, user_files
-from ..config import Config, PlannerConfig
-from ..errors import CheckpointError, UsageError
-from ..presets import preset_config
-from ..storage import rundir
-
-_PRETRAINED = "pretrained"
+from .. import build, exploration, model_file, robots
+from ..config import PlannerConfig
+from ..errors import UsageError
+from ..presets import quick_search
 
 
 class Source(NamedTuple):
@@ -42,14 +35,9 @@ def found(source: str, *, env: str | None = None, seed: int | None = None) -> So
         cannot be drawn.
       CheckpointError: if a run's folder cannot be read.
     """
-    path, name = Path(source), source.removeprefix(f"{_PRETRAINED}/")
+    path = model_file.named(Path(source))
     if path.is_dir():
         return _of_run(path, env, seed)
-    if name != source and not path.exists():
-        try:
-            path = models.path(name)
-        except ValueError as error:
-            raise UsageError(f"--from {source} is not valid; {error}") from error
     return _of_file(path, source, env)
 
 
@@ -66,42 +54,13 @@ def robot_named(env: str) -> Robot:
 
 
 def _of_file(path: Path, said: str, env: str | None) -> Source:
-    try:
-        about = models.about(path)
-        model, params = jaxpets.load_model(path)
-    except FileNotFoundError as error:
-        valid = "there is no such run or model"
-        raise UsageError(f"--from {said} is not valid; {valid}.") from error
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(str(error)) from error
-    name = env or about.get("environment")
-    if not isinstance(name, str):
-        raise UsageError(f"--env is missing; {said} does not say of which robot it is.")
-    user_files.check_named("--env", env, name, path)
-    robot = robot_named(name)
-    config = model.config
+    model = model_file.read(path, said)
+    robot = robot_named(model_file.robot_of(model, said, env))
+    model_file.check_fits(model, robot, said)
+    config = model.ensemble.config
     assert config is not None
-    sizes = (model.obs_size, model.action_size)
-    own = model.space.coordinates if model.space else ()
-    if sizes != robots.sizes(robot) or (own and own != robot.space.coordinates):
-        raise UsageError(f"--env {name} is not valid; {said} is of another robot.")
-    return Source(robot, config, params, _search(about.get("search"), said), said)
-
-
-def _search(said: Any, where: str) -> PlannerConfig:
-    """Returns the search that a file says is good for its model.
-
-    Raises:
-      CheckpointError: if it is none, or one with numbers beyond reason.
-    """
-    try:
-        if not isinstance(said, dict):
-            raise TypeError("it says no search")
-        own = dict(said.get("settings", {}))
-        own |= {x: said[x] for x in ("optimizer", "num_particles")}
-        return msgspec.convert(own | {"precision": "f32"}, PlannerConfig)
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{where} cannot be planned with ({error}).") from error
+    search = model_file.search_of(model, said)
+    return Source(robot, config, model.params, search, said)
 
 
 def _of_run(run: Path, env: str | None, seed: int | None) -> Source:
@@ -110,13 +69,4 @@ def _of_run(run: Path, env: str | None, seed: int | None) -> Source:
     robot = robot_named(env or config.env)
     title = f"{run.name}, trial {known.trial}"
     size = build.ensemble_config(config.model)
-    return Source(robot, size, known.params, _quick(config), title)
-
-
-def _quick(config: Config) -> PlannerConfig:
-    """Returns a search that two cores are quick enough for."""
-    if config.preset != "paper":
-        return config.task_planner
-    laptop = preset_config("laptop", rundir.label(config.arm), config.env)
-    members = config.model.num_members
-    return dataclasses.replace(laptop.task_planner, num_particles=members)
+    return Source(robot, size, known.params, quick_search(config), title)

@@ -2,11 +2,10 @@
 
 `experiments.tools.share` writes it beside the file, in the form of the Hugging Face
 Hub. Every number in it is of the file, of a run's config and log, or of the logs of
-zero-shots. `python -m experiments.tools.card` writes those of the shipped models again.
+zero-shots.
 """
 
 import json
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,20 +15,14 @@ import numpy as np
 import jaxpets
 from jaxpets import models
 
-from .. import cli, exploration
+from .. import exploration
 from ..config import Config, PlannerConfig
 from ..errors import UsageError
 from ..report import stats
-from ..storage import disk, metrics, rundir
+from ..storage import metrics, rundir
 from ..storage.folder import RunFolder
 from ..storage.metrics import Row, number
 
-_RESULTS = Path(__file__).parents[2] / "results"
-# Zero-shots at the paper's size with the models that come along.
-_SHIPPED = {
-    "best": "paper/best-1-3/zero-shot-060-refit-400",
-    "epistemic": "paper-no-refit/epistemic-0/zero-shot-060",
-}
 _SAID = ("environment", "licence", "training", "search")
 _HEAD = """---
 license: {licence}
@@ -86,7 +79,7 @@ def text(file: Path, run: Path, returns: Sequence[Path] | None) -> str:
 
     Args:
       file: from `experiments.tools.share`.
-      run: the exploration that the model is of.
+      run: the exploration that the model is of, or a zero-shot in it.
       returns: folders of zero-shots with it; None for those in the run's folder.
 
     Raises:
@@ -103,7 +96,7 @@ def text(file: Path, run: Path, returns: Sequence[Path] | None) -> str:
         "## How to use it",
         _usage(facts),
         "## What it is",
-        _bullets(_model(facts.model)),
+        _bullets(_model(facts)),
         "## What it saw",
         _bullets(_seen(facts)),
         "## How it was trained",
@@ -117,18 +110,15 @@ def text(file: Path, run: Path, returns: Sequence[Path] | None) -> str:
     return "\n\n".join(parts)
 
 
-def shipped(name: str) -> str:
-    """Returns the card of a model that comes along."""
-    folders = (_SHIPPED[name], f"pretrained-laptop/{name}/zero-shot-060")
-    returns = [_RESULTS / folder for folder in folders]
-    return text(models.path(name), cli.PRETRAINED / name, returns)
-
-
 def _facts(file: Path, run: Path, returns: Sequence[Path] | None) -> _Facts:
     about = models.about(file)
     if missing := [word for word in _SAID if not about.get(word)]:
         raise UsageError(f"{file} does not say its {', '.join(missing)}.")
     seed, trials = (about["training"][word] for word in ("seed", "num_trials"))
+    config = exploration.config_of(RunFolder(run))
+    if config.phase != "explore":
+        returns, run = returns or [run], run.parent
+        config = exploration.config_of(RunFolder(run))
     performed = []
     for folder in sorted(run.glob("zero-shot-*")) if returns is None else returns:
         rows = [r for r in _rows(folder) if (r.seed, r.explored) == (seed, trials)]
@@ -139,7 +129,6 @@ def _facts(file: Path, run: Path, returns: Sequence[Path] | None) -> _Facts:
         elif returns is not None:
             raise UsageError(f"{folder} has no trial of seed {seed} after {trials}.")
     explored = [row for row in _rows(run) if row.seed == seed and row.trial <= trials]
-    config = exploration.config_of(RunFolder(run))
     model, _ = jaxpets.load_model(file)
     return _Facts(file, about, model, config, explored, performed)
 
@@ -173,18 +162,21 @@ def _front_matter(facts: _Facts) -> str:
 
 
 def _usage(facts: _Facts) -> str:
-    name, search = facts.file.stem, facts.about["search"]
-    shipped = name in models.names() and models.path(name).samefile(facts.file)
+    search = facts.about["search"]
+    shipped = [x for x in models.names() if models.path(x).samefile(facts.file)]
     settings = (f"{key}={value!r}" for key, value in search["settings"].items())
     return _USAGE.format(
-        load=f'pretrained("{name}")' if shipped else f'load_model("{facts.file.name}")',
+        load=f'pretrained("{shipped[0]}")'
+        if shipped
+        else f'load_model("{facts.file.name}")',
         particles=search["num_particles"],
         optimizer=search["optimizer"],
         settings=",\n    ".join(settings),
     )
 
 
-def _model(model: jaxpets.Ensemble) -> Iterator[str]:
+def _model(facts: _Facts) -> Iterator[str]:
+    model = facts.model
     config, space = model.config, model.space
     assert config is not None and space is not None
     widths = " x ".join(map(str, config.hidden_sizes))
@@ -193,6 +185,8 @@ def _model(model: jaxpets.Ensemble) -> Iterator[str]:
     yield f"Read are {sizes} of an action; predicted is the next observation."
     names = ", ".join(f"`{row.name}`" for row in space.coordinates) or "without names"
     yield f"Entries: {names}."
+    if rounded := facts.about.get("weights"):
+        yield f"Its weights are rounded to {rounded}."
 
 
 def _seen(facts: _Facts) -> Iterator[str]:
@@ -287,14 +281,3 @@ def _limits(model: jaxpets.Ensemble) -> Iterator[str]:
 
 def _bullets(lines: Iterator[str]) -> str:
     return "\n".join(f"- {line}" for line in lines)
-
-
-def main() -> int:
-    """Writes the cards of the models that come along; returns the exit code."""
-    for name in models.names():
-        disk.write(models.path(name).with_suffix(".md"), shipped(name).encode())
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,8 +1,8 @@
 """`python -m experiments.tools.share RUN FILE`: a run's model as one file.
 
-What `jaxpets.load_model` reads, with the numbers that the run performs with, and a card
-beside it. The files of `jaxpets.pretrained` were written by this, from
-`experiments/pretrained`.
+What `jaxpets.load_model` reads, with a search that two cores are quick enough for, and
+a card beside it. RUN is the folder of an exploration, or of a zero-shot in it, whose
+model is that after the refit. The files of `jaxpets.pretrained` were written by this.
 """
 
 import argparse
@@ -16,7 +16,9 @@ import jaxpets
 
 from .. import exploration
 from ..config import Config, PlannerConfig
-from ..errors import RunError
+from ..entries import to_json
+from ..errors import RunError, storage_errors
+from ..presets import quick_search
 from ..storage import disk, rundir
 from ..storage.folder import RunFolder
 from . import card
@@ -30,16 +32,18 @@ _SETTINGS = {
 
 
 def share(
-    run: Path, path: Path, *, seed: int | None, env: str | None, licence: str
-) -> None:
-    """Writes the model of an exploration run to one file.
+    run: Path, path: Path, *, seed: int | None, env: str | None, licence: str,
+    half: bool = False,
+) -> None:  # fmt: skip
+    """Writes the model of a run to one file.
 
     Args:
-      run: folder of the run.
+      run: folder of an exploration, or of a zero-shot in it.
       path: of the file.
       seed: which of the run's; None for the first.
       env: the robot, which must be said if it is of a file.
       licence: of the file.
+      half: whether weights are rounded to float16.
 
     Raises:
       RunError: if the run has no checkpoint or not that seed, or its robot is of a
@@ -47,20 +51,21 @@ def share(
     """
     found = exploration.explored(run, seed=seed, env=env)
     config = found.config
+    search = quick_search(config)
     about = {
         "environment": config.env if env is None else rundir.label(env),
         "licence": licence,
         "training": _training(RunFolder(run), config, found.seed, found.trial),
-        "search": _search(config.task_planner),
-    }
-    model = _as_performed(found.parts.model, config)
-    jaxpets.save_model(path, model, found.params, about=about)
+        "search": _search(search),
+    } | ({"weights": "float16"} if half else {})
+    model = _planned_with(found.parts.model, search)
+    jaxpets.save_model(path, model, found.params, about=about, half=half)
 
 
-def _as_performed(model: jaxpets.Ensemble, config: Config) -> jaxpets.Ensemble:
+def _planned_with(model: jaxpets.Ensemble, search: PlannerConfig) -> jaxpets.Ensemble:
     """Returns the ensemble in the precision in which tasks are planned."""
     assert model.config is not None and model.space is not None
-    precision = jaxpets.Precision(config.task_planner.precision)
+    precision = jaxpets.Precision(search.precision)
     return jaxpets.ensemble(
         dataclasses.replace(model.config, precision=precision),
         model.space,
@@ -72,13 +77,13 @@ def _as_performed(model: jaxpets.Ensemble, config: Config) -> jaxpets.Ensemble:
 def _training(
     folder: RunFolder, config: Config, seed: int, trial: int
 ) -> dict[str, Any]:
-    performed = folder.find_json(f"performed-{rundir.CONFIG}")
+    refitted = config.phase == "zero-shot" and config.refit.num_epochs
     return {
         "arm": rundir.label(config.arm),
         "seed": seed,
         "num_trials": trial,
         "trial_length": config.trial_length,
-        "refit": performed.get("refit"),
+        "refit": to_json(config.refit) if refitted else None,
         "software": folder.find_json(rundir.ENVIRONMENT),
     }
 
@@ -96,17 +101,22 @@ def _search(planner: PlannerConfig) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Shares a model; returns the exit code, as `experiments.run`."""
     parser = argparse.ArgumentParser(prog=f"{__package__}.share", description=__doc__)
-    parser.add_argument("run", type=Path, help="folder of an exploration run")
+    words = "folder of an exploration, or of a zero-shot in it"
+    parser.add_argument("run", type=Path, help=words)
     parser.add_argument("file", type=Path, help="as model.safetensors")
     parser.add_argument("--seed", type=int, help="by default the run's first")
     parser.add_argument("--env", help="the robot of the run, if it is of a file")
+    words = "round the weights to float16: a file of half the size"
+    parser.add_argument("--half", action="store_true", help=words)
     parser.add_argument("--licence", default="Apache-2.0", help="of the file")
     words = "zero-shots with it, for its card; by default those in the run's folder"
     parser.add_argument("--returns", type=Path, nargs="+", metavar="DIR", help=words)
     args = parser.parse_args(argv)
-    options = {"env": args.env, "licence": args.licence}
+    options = {"env": args.env, "licence": args.licence, "half": args.half}
     try:
-        share(args.run, args.file, seed=args.seed, **options)
+        with storage_errors(f"write {args.file}"):
+            args.file.parent.mkdir(parents=True, exist_ok=True)
+            share(args.run, args.file, seed=args.seed, **options)
         said = card.text(args.file, args.run, args.returns)
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -21,11 +21,13 @@ from jaxpets.envs import Robot, env_rollout, with_constants
 
 from .. import acting, robots
 from ..build import imagined_end, optimizer
-from ..config import EngineName, PlannerConfig
+from ..config import Config, EngineName, PlannerConfig
 from ..errors import RunError
-from ..presets import PRETRAINED_PLANNER
+from ..presets import quick_search
 from ..storage import metrics, rundir
 from ..storage.environment import environment
+
+_SEARCH = quick_search(Config())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Arguments:
     """What steps the physics, imagined and real."""
     json: Path | None = None
     """Appends a row per trial to this file."""
-    task_planner: PlannerConfig = PRETRAINED_PLANNER
+    task_planner: PlannerConfig = _SEARCH
     """By default the search of the models that come with the code."""
 
 

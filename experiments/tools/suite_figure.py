@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from ..report import style, tables
 
 # Of which system, after the fewest (0) or the most (-1) of its steps, and how drawn.
-_OTHERS = (
+_OTHERS: tuple[tuple[str, int, dict[str, Any]], ...] = (
     ("Plan2Explore, zero-shot", 0, {"color": style.VERMILLION, "fillstyle": "none"}),
     ("Plan2Explore, zero-shot", -1, {"color": style.VERMILLION}),
     ("TD-MPC2", 0, {"color": style.GREEN}),
@@ -39,7 +39,7 @@ def draw(
     arms = tables.in_order(found)
     shown = [other for other in _OTHERS if other[0] in others]
     with mpl.rc_context(style.STYLE):
-        figure = style.new_figure(10.0, 4.6)
+        figure: Any = style.new_figure(10.0, 4.6)
         panels = figure.subplots(1, len(groups), squeeze=False, sharex=True)[0]
         for axes, (title, tasks) in zip(panels, groups.items(), strict=True):
             axes.set_title(title)
@@ -82,4 +82,4 @@ def _seeds(
         paint = style.arm_color(arm, list(found))
         seeds = [x for x in numbers["seeds"].values() if np.isfinite(x)]
         axes.plot(seeds, [height] * len(seeds), "|", color=paint, alpha=0.5)
-        axes.plot(numbers["mean"], height, "o", color=paint, markersize=5)
+        axes.plot([numbers["mean"]], [height], "o", color=paint, markersize=5)

@@ -80,13 +80,13 @@ def check_sizes(file: tensor_file.TensorFile, facts: Mapping[str, Any]) -> None:
 def check_arrays(
     file: tensor_file.TensorFile, wanted: Mapping[str, tuple[int, ...]]
 ) -> None:
-    """Refuses a file unless its arrays are these, all of float32."""
+    """Refuses a file unless its arrays are these, of float32 or rounded to float16."""
     for name in sorted(wanted.keys() | file.shapes.keys()):
         got, want = file.shapes.get(name), wanted.get(name)
         if got != want:
             refuse(file, f"{name} must be of shape {want}, got {got}")
-        if file.dtypes[name] != "float32":
-            refuse(file, f"{name} must be float32, got {file.dtypes[name]}")
+        if file.dtypes[name] not in ("float32", "float16"):
+            refuse(file, f"{name} must be float32 or float16, got {file.dtypes[name]}")
 
 
 def space_to_json(space: ModelSpace) -> Any:

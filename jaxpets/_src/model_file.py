@@ -27,6 +27,7 @@ def save_model(
     params: EnsembleParams,
     *,
     about: Mapping[str, Any] | None = None,
+    half: bool = False,
 ) -> None:
     """Writes a model to one file, which whoever reads it need not trust.
 
@@ -42,6 +43,8 @@ def save_model(
       about: anything else that JSON can hold, for `models.about`; by custom
         "environment", "licence", "training" (how it came to be) and "search" (the
         numbers to plan with).
+      half: whether to round the weights of the networks to float16, in half the room.
+        They are read as float32 again.
 
     Raises:
       TypeError, ValueError: if model is no ensemble of `jaxpets.ensemble`, params are
@@ -55,6 +58,10 @@ def save_model(
             "an ensemble of your own."
         )
     params_check(model.init)(params)
+    if half:
+        members = jax.tree.map(_halved, params.network.members)
+        network = params.network._replace(members=members)
+        params = params._replace(network=network)
     arrays = {
         name: np.asarray(array) for name, array in tensor_file.named(params).items()
     }
@@ -69,6 +76,15 @@ def save_model(
     texts = {"model": facts, "about": dict(about or {})}
     metadata = file_facts.metadata(_KIND, texts)
     tensor_file.write(path, arrays, metadata)
+
+
+def _halved(weights: Any) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        rounded = np.asarray(weights).astype(np.float16)
+    if np.isinf(rounded).any():
+        limit = np.finfo(np.float16).max
+        raise ValueError(f"params have weights beyond {limit:g}: not for half.")
+    return rounded
 
 
 def load_model(
@@ -104,7 +120,9 @@ def load_model(
         )
     arrays = file.arrays()
     file_facts.check_no_nan(str(file.path), arrays)
-    leaves = [jnp.asarray(arrays[name]) for name in tensor_file.named(template)]
+    leaves = [
+        jnp.asarray(arrays[name], jnp.float32) for name in tensor_file.named(template)
+    ]
     structure = cast(Any, jax.tree.structure(template))
     params = cast(EnsembleParams, jax.tree.unflatten(structure, leaves))
     return model, params

@@ -12,7 +12,8 @@ _SHIPPED = Path(__file__).parents[1] / "models"
 
 def names() -> tuple[str, ...]:
     """Returns the names of the models that come with the library."""
-    return tuple(sorted(file.stem for file in _SHIPPED.glob("*.safetensors")))
+    files = (file.relative_to(_SHIPPED) for file in _SHIPPED.rglob("*.safetensors"))
+    return tuple(sorted(file.with_suffix("").as_posix() for file in files))
 
 
 def path(name: str) -> Path:
@@ -28,13 +29,14 @@ def path(name: str) -> Path:
 
 
 def pretrained(name: str) -> tuple[Ensemble, EnsembleParams]:
-    """Returns a model of HalfCheetah that comes with the library.
+    """Returns a model that comes with the library: it explored without a reward.
 
-    It explored for 60 trials of 1000 steps without a reward. The numbers to plan with,
-    and how it came to be, are in `models.about(models.path(name))`.
+    Of which robot it is, the numbers to plan with, and how it came to be are in
+    `models.about(models.path(name))`.
 
     Args:
-      name: "best" or "epistemic", the arms of the README.
+      name: "best" or "epistemic", two arms of the README on HalfCheetah; "dmc/walker"
+        and others of `models.names()`, of the DeepMind Control Suite.
 
     Returns:
       The ensemble and what it has learned, as `load_model`.

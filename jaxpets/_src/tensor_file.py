@@ -11,7 +11,9 @@ import jax
 import numpy as np
 
 # As safetensors names what is kept here.
-_DTYPES = {"F32": "float32", "I32": "int32", "U32": "uint32", "BOOL": "bool"}
+_DTYPES = {
+    "F32": "float32", "F16": "float16", "I32": "int32", "U32": "uint32", "BOOL": "bool",
+}  # fmt: skip
 
 
 class TensorFile(NamedTuple):
@@ -44,7 +46,7 @@ def write(
 
     Args:
       path: of the file; its folder must be there.
-      arrays: float32, int32, uint32 or bool.
+      arrays: float32, float16, int32, uint32 or bool.
       metadata: texts by name.
 
     Raises:

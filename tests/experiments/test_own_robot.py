@@ -14,7 +14,7 @@ from experiments.errors import UsageError
 from experiments.report import style
 from experiments.run import main
 from experiments.storage import rundir
-from experiments.tools import model_error, pretrained, video
+from experiments.tools import model_error, share, video
 from jaxpets import envs
 
 FILE = own_robot.__file__
@@ -121,8 +121,8 @@ def test_a_tool_runs_no_file_that_only_a_run_names(out, tmp_path, capsys):
     flags = (str(out / NAME), "--out", str(tmp_path / "error.json"))
     assert model_error.main(flags) == 2
     assert f"only if you name it: --env {FILE}." in capsys.readouterr().err
-    assert pretrained.main([str(out / NAME), "mine"]) == 2
-    assert f"needs {FILE}, which does not come with" in capsys.readouterr().err
+    assert share.main([str(out / NAME), str(tmp_path / "m.safetensors")]) == 2
+    assert f"only if you name it: --env {FILE}." in capsys.readouterr().err
 
 
 def test_a_robot_without_a_model_is_not_drawn():

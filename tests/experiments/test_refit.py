@@ -14,7 +14,6 @@ from experiments import cli, exploration
 from experiments.build import REFIT, build, trial_keys
 from experiments.run import main
 from experiments.storage import checkpoint
-from experiments.tools import pretrained
 from jaxpets.envs import half_cheetah
 
 FLAGS = (
@@ -136,25 +135,3 @@ def test_finetune_refits_once(explored, tmp_path, capsys):
     assert main(command) == 0
     assert "refit" not in capsys.readouterr().err
     assert [runs.numbers(row) for row in runs.rows(tuned)] == want
-
-
-@pytest.mark.slow
-def test_one_seed_of_several_is_shipped(
-    explored, performed, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr(cli, "PRETRAINED", tmp_path)
-    assert pretrained.main([str(explored), "mine", "--seed", "7"]) == 0
-    config = cli.parse(["--phase", "zero-shot", "--from", str(explored), *FLAGS])
-    flags = ["--from", "pretrained/mine", "--task-planner.num-particles", "3"]
-    shipped = cli.parse(["--phase", "zero-shot", *flags])
-    assert (shipped.seeds, shipped.refit.num_epochs) == ((7,), 0)
-    jax.tree.map(
-        lambda one, both: np.testing.assert_array_equal(one[0], both[1]),
-        model(tmp_path / "mine", shipped),
-        model(performed, config),
-    )
-    assert [row["seed"] for row in runs.rows(tmp_path / "mine")] == [7, 7, 7]
-    capsys.readouterr()
-    assert pretrained.main([str(explored), "other", "--seed", "3"]) == 2
-    line = "error: --seed 3 is not valid; it must be one of 0, 7.\n"
-    assert capsys.readouterr().err == line

@@ -4,6 +4,7 @@ import json
 import pickle
 import struct
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 import jaxpets
-from jaxpets import coordinates, models
+from jaxpets import coordinates, envs, models
 from jaxpets._src import tensor_file
 from jaxpets.coordinates import Coordinate
 
@@ -41,6 +42,24 @@ def test_what_was_saved_predicts_the_same(model, params, saved):
     toys.assert_trees_close(mean_and_variance(again, found), want, rtol=0)
     assert models.about(saved) == ABOUT
     assert [file.name for file in saved.parent.iterdir()] == [saved.name]
+
+
+def test_half_the_room_is_a_rounding(model, params, saved, tmp_path):
+    path = tmp_path / "half.safetensors"
+    jaxpets.save_model(path, model, params, half=True)
+    _, found = jaxpets.load_model(path)
+    chex.assert_trees_all_equal_dtypes(found, params)
+    chex.assert_trees_all_equal(found.scaler, params.scaler)
+    chex.assert_trees_all_close(found.network, params.network, rtol=2**-11, atol=1e-7)
+    weights = jax.tree.leaves(params.network.members)
+    rounded = jax.tree.leaves(found.network.members)
+    assert any(np.any(x != y) for x, y in zip(weights, rounded, strict=True))
+    small = 2 * sum(x.size for x in weights)
+    assert saved.stat().st_size - path.stat().st_size > small - 500
+    large = jax.tree.map(lambda x: x + 1e5, params.network.members)
+    wild = params._replace(network=params.network._replace(members=large))
+    with pytest.raises(ValueError, match="weights beyond 65504: not for half"):
+        jaxpets.save_model(path, model, wild, half=True)
 
 
 def test_coordinates_are_saved_and_own_functions_are_not(tmp_path):
@@ -154,7 +173,10 @@ ARRAYS = {
     "missing": (lambda x: {k: v for k, v in x.items() if k != BIAS}, BIAS),
     "one more": (lambda x: x | {"payload": x[BIAS]}, "payload"),
     "shape": (lambda x: x | {BIAS: x[BIAS][:, 1:]}, BIAS),
-    "dtype": (lambda x: x | {BIAS: x[BIAS].astype(np.int32)}, "must be float32"),
+    "dtype": (
+        lambda x: x | {BIAS: x[BIAS].astype(np.int32)},
+        "must be float32 or float16",
+    ),
     "kind": (lambda x: x | {BIAS: x[BIAS].astype(np.int64)}, "dtype of F32"),
     "NaN": (lambda x: x | {BIAS: x[BIAS] * np.float32("nan")}, "must have no NaN"),
     "axes": (lambda x: x | {"scaler.mean": x[BIAS]}, "scaler.mean must be of one axis"),
@@ -187,14 +209,16 @@ def test_only_what_can_be_read_is_written(tmp_path):
 
 
 def test_what_comes_with_the_library_is_read():
-    assert models.names() == ("best", "epistemic")
+    assert {"best", "epistemic", "dmc/walker"} < {*models.names()}
     for name in models.names():
         model, params = jaxpets.pretrained(name)
-        assert (model.obs_size, model.action_size, model.num_members) == (18, 6, 5)
-        assert np.isfinite(params.scaler.low).all()
         found = models.about(models.path(name))
-        assert found["environment"] == "pets/half_cheetah"
-        assert found["training"]["num_trials"] == 60
+        robot = envs.make(found["environment"], backend="mujoco")
+        assert found["environment"] in (name, "pets/half_cheetah")
+        assert robot.space.coordinates == model.space.coordinates
+        assert robot.env.action_low.shape == (model.action_size,)
+        assert np.isfinite(params.scaler.low).all()
+        assert found["training"]["num_trials"] in (60, 100)
         search = getattr(jaxpets.optimizers, found["search"]["optimizer"])
         high = np.ones(model.action_size)
         search(action_low=-high, action_high=high, **found["search"]["settings"])

@@ -1,0 +1,207 @@
+"""A model as one file, in place of the run that explored it.
+
+`pretrained/NAME` is one that comes with the library; any other is a path. Such a model
+performs, but there are no data to learn on.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import jax
+import msgspec
+
+import jaxpets
+from jaxpets import models
+
+from . import robots, user_files
+from .config import Config, ModelConfig, PlannerConfig
+from .entries import from_json
+from .errors import CheckpointError, UsageError
+from .presets import preset_config
+from .storage import rundir
+
+if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
+    from .storage.folder import RunFolder
+
+PRETRAINED = "pretrained"
+
+
+class Model(NamedTuple):
+    """What is in a file; all of it may come from a stranger."""
+
+    path: Path
+    about: Mapping[str, Any]
+    ensemble: jaxpets.Ensemble
+    params: jaxpets.EnsembleParams
+
+
+class ModelFile(NamedTuple):
+    """What performing needs of the folder of a run, of a file."""
+
+    path: Path
+
+    def steps(self) -> list[int]:
+        """Returns the trials behind the model: one number, 0 if the file has none."""
+        return [_training(models.about(self.path)).get("num_trials", 0)]
+
+    def below(self, pattern: str) -> list[Any]:
+        """Returns no run: nothing performed in this folder."""
+        del pattern
+        return []
+
+    def restore_trial(self, trial: int, template: Any, *, part: bool) -> Any:
+        """Returns a learner `[S]` that has the model of one seed, and nothing else."""
+        del trial, part
+        form = template({}) if callable(template) else template
+        params = jax.tree.map(lambda x: x[None], read(self.path, str(self.path)).params)
+        return jax.tree.map(lambda _: None, form)._replace(params=params)
+
+
+Source: TypeAlias = "RunFolder | ModelFile"  # what a later phase starts from
+
+
+def named(source: Path) -> Path:
+    """Returns the path of a file or folder, which may be called `pretrained/NAME`.
+
+    Raises:
+      UsageError: if no model of that name comes with the library.
+    """
+    if source.exists() or source.parts[:1] != (PRETRAINED,):
+        return source
+    try:
+        return models.path("/".join(source.parts[1:]) or "epistemic")
+    except ValueError as error:
+        raise UsageError(f"--from {source} is not valid; {error}") from error
+
+
+def read(path: Path, said: str) -> Model:
+    """Reads a model.
+
+    Args:
+      path: of the file.
+      said: what the user calls it.
+
+    Raises:
+      UsageError: if there is no such file.
+      CheckpointError: if it is not one of a model.
+    """
+    try:
+        return Model(path, models.about(path), *jaxpets.load_model(path))
+    except FileNotFoundError as error:
+        valid = "there is no such run or model"
+        raise UsageError(f"--from {said} is not valid; {valid}.") from error
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(str(error)) from error
+
+
+def robot_of(model: Model, said: str, env: str | None) -> str:
+    """Returns of which robot a model is: what the command line says, or the file.
+
+    Raises:
+      UsageError: if neither says, or the robot is of a file that only the model names.
+    """
+    name = env or model.about.get("environment")
+    if not isinstance(name, str):
+        raise UsageError(f"--env is missing; {said} does not say of which robot it is.")
+    user_files.check_named("--env", env, name, model.path)
+    return name
+
+
+def check_fits(model: Model, robot: Any, said: str) -> None:
+    """Refuses a model of another robot.
+
+    Raises:
+      UsageError: if its sizes or its entries are not those of the robot.
+    """
+    sizes = (model.ensemble.obs_size, model.ensemble.action_size)
+    own = model.ensemble.space.coordinates if model.ensemble.space else ()
+    if sizes != robots.sizes(robot) or (own and own != robot.space.coordinates):
+        valid = f"{said} is of another robot"
+        raise UsageError(f"--env {robot.name} is not valid; {valid}.")
+
+
+def search_of(model: Model, said: str) -> PlannerConfig:
+    """Returns the search that a file says is good for its model.
+
+    Raises:
+      CheckpointError: if it is none, or one with numbers beyond reason.
+    """
+    search = model.about.get("search")
+    try:
+        if not isinstance(search, dict):
+            raise TypeError("it says no search")
+        own = dict(search.get("settings", {}))
+        own |= {x: search[x] for x in ("optimizer", "num_particles")}
+        return msgspec.convert(own | {"precision": "f32"}, PlannerConfig)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{said} cannot be planned with ({error}).") from error
+
+
+def config_of(path: Path, config: Config) -> Config:
+    """Returns what a run with this model would have been started with.
+
+    What the file does not say is that of the preset `laptop`: a task is performed
+    once, and planned with the file's own search.
+
+    Args:
+      path: of the file.
+      config: of the command line, with the robot or the arm if they are of files.
+
+    Raises:
+      RunError: if the file cannot be read, or says what cannot be.
+    """
+    said = str(path)
+    model = read(path, said)
+    own = config.env if user_files.is_file(config.env) else None
+    env = robot_of(model, said, own)
+    training = _training(model.about)
+    arm = _arm(str(training.get("arm", config.arm)), config.arm, said)
+    given = {"seeds": [training.get("seed", 0)], "env": env, "arm": arm}
+    for name in ("num_trials", "trial_length"):
+        given |= {name: training[name]} if name in training else {}
+    if length := given.get("trial_length"):
+        given["task_length"] = length
+    default, sizes = preset_config("laptop", arm, env), _sizes(model, said)
+    members = sizes.num_members
+    search = dataclasses.replace(default.task_planner, num_particles=members)
+    if "search" in model.about:
+        search = search_of(model, said)
+    own_config = dataclasses.replace(
+        from_json(given, default, said),
+        engine="mujoco",
+        eval_trials=1,
+        model=sizes,
+        refit=dataclasses.replace(default.refit, num_epochs=0),  # as it performed
+        planner=search,
+        task_planner=search,
+    )
+    check_fits(model, robots.of(own_config), said)
+    return own_config
+
+
+def _training(about: Mapping[str, Any]) -> Mapping[str, Any]:
+    training = about.get("training")
+    return training if isinstance(training, dict) else {}
+
+
+def _arm(said: str, given: str, where: str) -> str:
+    """Returns the arm that explored; one of a user's file is known by its label."""
+    if said == rundir.label(given):
+        return given
+    try:
+        return from_json({"arm": said}, Config(), where).arm
+    except CheckpointError as error:
+        words = f"{where} was explored by an arm of its own, {said!r}: name its file"
+        raise UsageError(f"--arm is missing; {words}.") from error
+
+
+def _sizes(model: Model, said: str) -> ModelConfig:
+    """Returns the sizes of an ensemble whose hidden layers are equal."""
+    config = model.ensemble.config
+    assert config is not None
+    widths = config.hidden_sizes
+    if len({*widths}) > 1:
+        raise UsageError(f"{said} has hidden layers of several widths: {widths}.")
+    return ModelConfig(config.num_members, widths[0], len(widths), config.state_margin)
