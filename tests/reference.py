@@ -89,13 +89,13 @@ def swish(x):
     return x / (1.0 + np.exp(-x))
 
 
-def forward(kernels, biases, inputs):
+def forward(kernels, biases, inputs, activate=swish):
     """One member: kernels `[in, out]`, inputs `[B, in]` -> mean, raw log variance."""
     hidden = np.float64(inputs)
     for layer, (kernel, bias) in enumerate(zip(kernels, biases, strict=True)):
         hidden = hidden @ np.float64(kernel) + np.float64(bias)
         if layer < len(kernels) - 1:
-            hidden = swish(hidden)
+            hidden = activate(hidden)
     half = hidden.shape[-1] // 2
     return hidden[..., :half], hidden[..., half:]
 

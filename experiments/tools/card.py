@@ -181,7 +181,8 @@ def _model(facts: _Facts) -> Iterator[str]:
     assert config is not None and space is not None
     widths = " x ".join(map(str, config.hidden_sizes))
     sizes = f"{model.obs_size} numbers of an observation and {model.action_size}"
-    yield f"{config.num_members} networks of {widths} swish units, each a Gaussian."
+    units = f"{widths} {config.activation} units"
+    yield f"{config.num_members} networks of {units}, each a Gaussian."
     yield f"Read are {sizes} of an action; predicted is the next observation."
     names = ", ".join(f"`{row.name}`" for row in space.coordinates) or "without names"
     yield f"Entries: {names}."

@@ -135,7 +135,9 @@ def ensemble(
     feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
     input_size = feature_size + action_size
     decays = layer_decays(config)
-    network = Network(config.hidden_sizes, 2 * obs_size, config.precision)
+    network = Network(
+        config.hidden_sizes, 2 * obs_size, config.precision, config.activation
+    )
     init_member = cast(Callable[[Array, Array], Any], network.init)
     apply_members = jax.vmap(cast(Callable[[Any, Array], Array], network.apply))
 

@@ -11,7 +11,7 @@ from jaxpets._src.checks import (
     check_record,
     is_sequence,
 )
-from jaxpets._src.network import Precision
+from jaxpets._src.network import ACTIVATIONS, Precision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +31,8 @@ class EnsembleConfig:
         its width; None leaves them free. Not in PETS: without it a learned model can
         blow up while every number stays finite, and a planner that looks for
         disagreement finds that.
+      activation: of the hidden layers: "swish" as in PETS, "tanh", "relu" or "gelu" (by
+        way of tanh).
     """
 
     num_members: int = 5
@@ -39,6 +41,7 @@ class EnsembleConfig:
     bound_decay: float = 0.01
     precision: Precision = Precision.TF32
     state_margin: float | None = 0.5
+    activation: str = "swish"
 
     def __post_init__(self) -> None:
         check_count("num_members", self.num_members)
@@ -48,6 +51,11 @@ class EnsembleConfig:
         check_record("precision", self.precision, Precision)
         if self.state_margin is not None:
             check_real("state_margin", self.state_margin, 0.0)
+        if self.activation not in ACTIVATIONS:
+            valid = ", ".join(ACTIVATIONS)
+            raise ValueError(
+                f"activation must be one of {valid}, got {self.activation!r}."
+            )
 
 
 def _check_decays(decays: Any, num_layers: int) -> None:

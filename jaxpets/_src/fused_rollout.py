@@ -22,7 +22,7 @@ from jaxpets._src.kernel.gpu_layout import GpuLayout
 from jaxpets._src.kernel.jaxpr_to_cpp import UnsupportedError, cpp_function
 from jaxpets._src.kernel.mma_layout import MmaLayout
 from jaxpets._src.kernel.wgmma_layout import WgmmaLayout
-from jaxpets._src.network import Precision
+from jaxpets._src.network import ACTIVATIONS, Precision
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import ModelSpace
 
@@ -83,9 +83,11 @@ def fused_rollout(
     - keys are not of JAX's default kind, partitionable threefry (only a call can know:
       it warns);
     - the device is neither a CPU nor a GPU of compute capability 8.0 or later (A100,
-      RTX 30 and later). Those of 9.0 (H100, H200, GH200) have a kernel of their own;
-    - on a GPU, the precision is not BF16, a hidden layer has more than 256 units, an
-      observation more than 128 entries, or features and action together more than 256.
+      RTX 30 and later). Those of 9.0 (H100, H200, GH200) have a kernel of their own,
+      for layers of at most 256 units, observations of at most 128 entries and inputs
+      of at most 256; larger models run there as on any other;
+    - on a GPU, the precision is not BF16, a hidden layer has more than 512 units, an
+      observation more than 256 entries, or features and action together more than 512.
 
     Any number of members, particles, candidates, steps and hidden layers will do, and
     any nest of up to four `jax.vmap`.
@@ -113,6 +115,9 @@ def fused_rollout(
             )
         kind = Kind.WGMMA if arch == _HOPPER else Kind.MMA
     rollout = rollout_of_kind(model, num_particles, kind, arch)
+    if not rollout.uses_kernel and kind is Kind.WGMMA and arch is None:
+        larger = rollout_of_kind(model, num_particles, Kind.MMA)
+        rollout = larger if larger.uses_kernel else rollout
     if not rollout.uses_kernel:
         warnings.warn(f"fused_rollout runs as a scan: {rollout.reason}.", stacklevel=2)
     return rollout
@@ -137,7 +142,9 @@ def rollout_of_kind(
     def bind(params: EnsembleParams) -> Callable[[Array, Array, Array], Array]:
         check_record("params", params, EnsembleParams)
         layers = params.network.members["params"]
-        weights = layout.pack([layers[f"layer_{i}"] for i in range(len(layers))])
+        weights = layout.pack(
+            [layers[f"layer_{i}"] for i in range(len(layers))], config.activation
+        )
         shared = _shared(config, params)
 
         def rollout(key: Array, obs: Array, actions: Array) -> Array:
@@ -217,7 +224,9 @@ def _model_header(
             for i, entry in enumerate(space.coordinates)
         }
         code.append(cpp_function(name, function, rows, called))
-    header = ['#pragma once\n#include "particle.h"', layout.header(), *code]
+    activation = f"constexpr int ACTIVATION = {ACTIVATIONS.index(config.activation)};"
+    begin = '#pragma once\n#include "particle.h"'
+    header = [begin, layout.header(), activation, *code]
     if kind.is_for_gpu and isinstance(layout, GpuLayout):
         header.append(layout.products())
     return "\n".join(header)

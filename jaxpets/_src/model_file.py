@@ -67,8 +67,7 @@ def save_model(
     }
     file_facts.check_no_nan("params", arrays)
     facts = {
-        "config": {name: getattr(config, name) for name in _CONFIG}
-        | {"precision": config.precision.value},
+        "config": _config_to_json(config),
         "obs_size": model.obs_size,
         "action_size": model.action_size,
         "space": file_facts.space_to_json(space),
@@ -151,7 +150,17 @@ def _facts(file: tensor_file.TensorFile) -> dict[str, Any]:
     return facts
 
 
+def _config_to_json(config: EnsembleConfig) -> dict[str, Any]:
+    """Returns a config as JSON; the usual activation is not said, as of old."""
+    found = {name: getattr(config, name) for name in _CONFIG}
+    if found["activation"] == EnsembleConfig.activation:
+        del found["activation"]
+    return found | {"precision": config.precision.value}
+
+
 def _config_from_json(file: tensor_file.TensorFile, found: Any) -> EnsembleConfig:
+    if isinstance(found, dict):
+        found = {"activation": EnsembleConfig.activation} | cast(Any, found)
     file_facts.check_keys(file, "config", found, _CONFIG)
     values = {name: _tuple(value) for name, value in found.items()}
     try:

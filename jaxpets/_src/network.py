@@ -2,6 +2,7 @@
 
 import enum
 import functools
+from collections.abc import Callable
 from typing import Any, cast
 
 import flax.linen as nn
@@ -22,16 +23,18 @@ class Precision(enum.Enum):
 
 
 class Network(nn.Module):
-    """One member: swish layers and a linear output of means and raw log-variances."""
+    """One member: hidden layers and a linear output of means and raw log-variances."""
 
     hidden_sizes: tuple[int, ...]
     output_size: int
     precision: Precision
+    activation: str = "swish"
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        activate = _FUNCTIONS[self.activation]
         for i, size in enumerate(self.hidden_sizes):
-            x = _swish(self._dense(i, size, x))
+            x = activate(self._dense(i, size, x))
         return self._dense(len(self.hidden_sizes), self.output_size, x)
 
     def _dense(self, index: int, size: int, x: Array) -> Array:
@@ -73,6 +76,15 @@ def _swish(x: Array) -> Array:
 
     # The same function; XLA has a faster tanh than sigmoid for CPUs.
     return cast(Array, jax.lax.platform_dependent(x, cpu=by_tanh, default=nn.swish))
+
+
+_FUNCTIONS: dict[str, Callable[[Array], Array]] = {
+    "swish": _swish,
+    "tanh": jnp.tanh,
+    "relu": nn.relu,
+    "gelu": functools.partial(nn.gelu, approximate=True),
+}
+ACTIVATIONS = tuple(_FUNCTIONS)  # the kernels know them by their places
 
 
 def _dot_general(

@@ -18,6 +18,7 @@ from benchmarks import (
     ratios,
     real_data,
     rollout,
+    shapes,
     timing,
     trace,
     trial,
@@ -178,6 +179,20 @@ def test_rollout_and_fit(tmp_path):
     found = fit.main(["--seeds", "2", "--epochs", "2", *common])
     check_rows(found, path, {"us_per_update"})
     assert found[0]["sizes"]["updates"] == 2 * 4  # 100 rows, the last batch partial
+
+
+def test_shapes(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    common = ["--tiny", "--repeats", "2", "--json", str(path), "--precision", "f32"]
+    found = shapes.main(["--shape", "gelu", "16 members", *common])
+    check_rows(found, path, {"tflops_per_s", "share_of_paper"}, {"arch": ""})
+    names = [row["sizes"]["shape"] for row in found]
+    assert names == ["paper", "gelu", "16 members"]
+    assert found[0]["share_of_paper"] == 1.0
+    assert found[1]["sizes"]["activation"] == "gelu"
+    # By hand: (24 x 8 + 8 x 8 + 8 x 36) x 2 for each of 4 x 20 x 2 steps.
+    shape = shapes.Shape(18, 6, (8, 8), num_samples=4, horizon=2)
+    assert shapes._flops(shape) == 2 * (24 * 8 + 8 * 8 + 8 * 36) * 160
 
 
 @pytest.mark.slow

@@ -81,6 +81,7 @@ class Case:
     num_samples: int = 4
     horizon: int = 5
     state_margin: float | None = 0.5
+    activation: str = "swish"
     space: jaxpets.ModelSpace = dataclasses.field(default_factory=jaxpets.delta_space)
 
     def config(self, precision=Precision.BF16):
@@ -89,6 +90,7 @@ class Case:
             hidden_sizes=self.hidden_sizes,
             precision=precision,
             state_margin=self.state_margin,
+            activation=self.activation,
         )
 
     def model(self, precision=Precision.F32):
@@ -173,6 +175,9 @@ CASES = {
         space=_observed("sensordata", "site_xpos", "qvel/hip"),
     ),
     "rich": Case(obs_size=4, space=RICH),
+    "tanh": dataclasses.replace(SMALL, activation="tanh"),
+    "relu": dataclasses.replace(SMALL, activation="relu"),
+    "gelu": dataclasses.replace(SMALL, activation="gelu"),
 }
 
 

@@ -22,6 +22,7 @@ from rollouts import (
 import jaxpets
 from jaxpets import Precision
 from jaxpets._src.chunks import window
+from jaxpets._src.kernel.build import Kind
 from jaxpets.envs import half_cheetah as hc
 from jaxpets.models import without_noise
 
@@ -34,6 +35,15 @@ def test_equals_the_scan(engine, name):
     assert np.isfinite(want).all()
     assert relative_error(got, want) <= engine.rounding
     np.testing.assert_array_equal(got[:, 0], want[:, 0])
+
+
+def test_wide_layers_equal_the_scan():
+    """As the kernel of other GPUs than Hopper reads them."""
+    case = dataclasses.replace(SMALL, hidden_sizes=(272, 512), horizon=2)
+    fused = case.of_kind(Kind.MMA_REFERENCE)
+    assert fused.uses_kernel
+    got, want = jax.jit(fused)(*case.args()), scan(case)(*case.args())
+    assert relative_error(got, want) <= 2e-4
 
 
 def test_is_closer_than_the_scan_in_bfloat16(engine):

@@ -13,6 +13,7 @@ from rollouts import (
     CHEETAH,
     SMALL,
     SOURCES,
+    Case,
     recorded,
     relative_error,
     stacked,
@@ -25,6 +26,8 @@ from jaxpets._src.kernel.build import Kernel, Kind
 
 PAPER = dataclasses.replace(CHEETAH, hidden_sizes=(200,) * 4)
 WIDE = dataclasses.replace(CASES["free joint"], obs_size=13, hidden_sizes=(256,) * 2)
+WIDEST = Case(110, 21, (512, 400), space=jaxpets.delta_space())
+GELU = dataclasses.replace(PAPER, activation="gelu")
 KINDS = [Kind.WGMMA, Kind.MMA]  # on a GPU that has both
 
 
@@ -85,6 +88,17 @@ def test_a_gpu_has_the_kernel_that_was_written_for_it(
     assert ("wgmma.mma_async" in kernel) == (kind is Kind.WGMMA)
 
 
+def test_what_is_too_large_for_hoppers_own_kernel_has_the_other(monkeypatch, asked):
+    pretend(monkeypatch, compute_capability="9.0")
+    wide = dataclasses.replace(SMALL, hidden_sizes=(400, 512))
+    fused, caught = recorded(wide.fused)
+    assert not caught and fused.uses_kernel and fused.arch == "sm_90"
+    wider = dataclasses.replace(SMALL, hidden_sizes=(513,))
+    fused, (warning,) = recorded(wider.fused)
+    assert not fused.uses_kernel and "wider than 256" in str(warning)
+    assert len(asked) == 1
+
+
 def test_a_gpu_may_be_named(monkeypatch, asked):
     """Hopper without its own instructions; or one that is not here."""
     pretend(monkeypatch, compute_capability="9.0")
@@ -114,7 +128,8 @@ ARCHS = ("sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 @pytest.mark.skipif(NVCC is None, reason="needs nvcc")
 @pytest.mark.parametrize(
     ("case", "arch"),
-    [(PAPER, arch) for arch in ARCHS] + [(WIDE, ARCHS[0]), (PAPER, "sm_90a")],
+    [(PAPER, arch) for arch in ARCHS]
+    + [(WIDE, ARCHS[0]), (PAPER, "sm_90a"), (WIDEST, ARCHS[0]), (GELU, "sm_90a")],
 )
 def test_kernels_are_compiled_without_spills(monkeypatch, asked, tmp_path, case, arch):
     """For every generation of GPUs, and the widest model."""
@@ -166,6 +181,19 @@ def test_the_kernel_equals_the_scan(name, kind):
 
 # Weights that stay in shared memory; that stream through a ring which holds a layer, or
 # does not; candidates for blocks of one tile, and for blocks of both kinds.
+@pytest.mark.gpu
+@pytest.mark.parametrize("hidden_sizes", [(272,) * 4, (384,) * 3, (512,) * 4])
+@pytest.mark.parametrize("obs_size", [18, 110, 256])
+def test_a_wide_kernel_equals_the_scan(hidden_sizes, obs_size):
+    """Also on Hopper, whose own kernel has no room for such a model."""
+    case = Case(obs_size, 21, hidden_sizes, num_members=5, particles=4, num_samples=200)
+    with jax.default_device(jax.devices("gpu")[0]):
+        fused = case.fused()
+        assert fused.uses_kernel and not fused.arch.endswith("a")
+        got, want = jax.jit(fused)(*case.args()), jax.jit(case.scan())(*case.args())
+        assert relative_error(got, want) <= 1e-3
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("num_samples", [70, 1000])

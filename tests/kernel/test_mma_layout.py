@@ -19,9 +19,28 @@ def test_two_blocks_share_a_multiprocessor_of_any_gpu_if_they_can():
 
 
 @pytest.mark.parametrize(
-    ("widest", "width"),
-    [(1, 24), (33, 64), (64, 64), (96, 96), (97, 128), (200, 200), (225, 256)],
+    ("sizes", "warps", "tiles"),
+    [
+        ((18, 6, 18, (256,) * 4), 4, 5),
+        ((18, 6, 18, (272,) * 4), 8, 5),
+        ((18, 6, 18, (512,) * 8), 8, 5),
+        ((110, 21, 110, (400, 512)), 8, 3),  # of a humanoid
+        ((256, 256, 256, (512,)), 8, 1),
+    ],
 )
+def test_wide_layers_are_for_more_warps(sizes, warps, tiles):
+    """Each has as many columns; one block is a multiprocessor's."""
+    layout = MmaLayout(*sizes)
+    assert layout.problem() is None
+    assert (layout.ring()["WARPS"], layout.ring()["TILES"]) == (warps, tiles)
+    assert layout.shared_bytes(tiles) <= SHARED_MEMORY
+
+
+WIDTHS = {1: 24, 33: 64, 64: 64, 96: 96, 97: 128, 200: 200, 225: 256, 257: 264}
+WIDTHS |= {272: 272, 289: 384, 400: 400, 416: 416, 417: 512}
+
+
+@pytest.mark.parametrize(("widest", "width"), WIDTHS.items())
 def test_few_columns_are_shared_by_all_warps(widest, width):
-    """Of 64 at most 32. More are filled up, so that each warp has some alone."""
+    """Of 64, or above 256 of 128, at most 32: else each warp gets some alone."""
     assert MmaLayout(18, 6, 18, (widest,)).width == width

@@ -72,6 +72,29 @@ def test_predict_equals_the_reference(model, params):
         np.testing.assert_allclose(variance[e], np.exp(logvar), rtol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("name", "activate"),
+    [
+        ("tanh", np.tanh),
+        ("relu", lambda x: np.maximum(x, 0.0)),
+        # Hendrycks and Gimpel, 2016.
+        ("gelu", lambda x: x / 2 * (1 + np.tanh((2 / np.pi) ** 0.5
+                                                * (x + 0.044715 * x**3)))),
+    ],
+)  # fmt: skip
+def test_units_of_other_kinds_equal_the_reference(name, activate):
+    model = toys.small_ensemble(activation=name)
+    params = jax.jit(model.init)(jax.random.key(3))
+    obs, action = np.ones((3, 1, 2), np.float32), np.full((1, 1), -0.5, np.float32)
+    mean, _ = jax.jit(model.predict)(params, obs, action)
+    kernels, biases = layers(params.network)
+    for e in range(3):
+        inputs = np.concatenate([obs[e], action], axis=-1)
+        member = [k[e] for k in kernels], [b[e] for b in biases]
+        want, _ = reference.forward(*member, inputs, activate)
+        np.testing.assert_allclose(mean[e], obs[e] + want, rtol=1e-4, atol=1e-5)
+
+
 def test_a_member_may_have_actions_of_its_own(model, params):
     obs, action = batch()
     own = jnp.stack([action, -action, 2.0 * action])
@@ -296,6 +319,8 @@ def test_delta_space_obeys_its_law():
             "precision must be a Precision, got str",
         ),
         (dict(state_margin=-1.0), ValueError, "state_margin must be finite"),
+        (dict(activation="elu"), ValueError, "activation must be one of swish, tanh"),
+        (dict(activation=None), ValueError, "activation must be one of .* got None"),
     ],
 )
 def test_bad_settings_fail_when_built(changes, error, text):

@@ -44,6 +44,15 @@ def test_what_was_saved_predicts_the_same(model, params, saved):
     assert [file.name for file in saved.parent.iterdir()] == [saved.name]
 
 
+def test_another_activation_comes_back(tmp_path):
+    model, path = toys.small_ensemble(activation="gelu"), tmp_path / "m"
+    params = jax.jit(model.init)(jax.random.key(1))
+    jaxpets.save_model(path, model, params)
+    again, found = jaxpets.load_model(path)
+    assert again.config == model.config and again.config.activation == "gelu"
+    chex.assert_trees_all_equal(found, params)
+
+
 def test_half_the_room_is_a_rounding(model, params, saved, tmp_path):
     path = tmp_path / "half.safetensors"
     jaxpets.save_model(path, model, params, half=True)

@@ -39,12 +39,16 @@ class CpuLayout:
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
         return "\n".join([*lines, f"constexpr int WIDTHS[] = {{{widths}}};"])
 
-    def pack(self, layers: Sequence[Mapping[str, Array]]) -> Array:
+    def pack(
+        self, layers: Sequence[Mapping[str, Array]], activation: str = "swish"
+    ) -> Array:
         """Returns weights and biases `[E, *]` of all layers, float32.
 
         Args:
           layers: `kernel` `[E, in, out]` and `bias` `[E, out]` of each, in order.
+          activation: of the hidden ones; their weights are as they are.
         """
+        del activation
         parts = itertools.chain.from_iterable(map(_tiles, layers))
         return jnp.concatenate(list(parts), axis=1)
 

@@ -45,13 +45,21 @@ struct Column {
   float& operator[](int i) const { return rows[i][p]; }
 };
 
-// x / (1 + exp(-x)); NaN of -infinity, as by way of tanh.
-float swish(float x) {
-  float twos = x * -1.44269504f;
+// x / (1 + exp(-rate)); NaN of -infinity, as by way of tanh.
+float sigmoid_times(float x, float rate) {
+  float twos = rate * -1.44269504f;
   twos = twos < 128.0f ? twos : 128.0f;  // of which the power is infinite
   twos = twos > -126.0f ? twos : -126.0f;
   const float shifted = twos + ROUNDER;
   return x / (1.0f + power_of_two(shifted, twos - (shifted - ROUNDER)));
+}
+
+float activated(float x) {
+  if (ACTIVATION == RELU) return x < 0.0f ? 0.0f : x;
+  if (ACTIVATION == TANH) return x != x ? x : sigmoid_times(2.0f, 2.0f * x) - 1.0f;
+  if (ACTIVATION == GELU)
+    return sigmoid_times(x, x * fmaf(0.0713548163f, x * x, 1.59576912f));
+  return sigmoid_times(x, x);
 }
 
 template <int OUTPUTS, bool IS_HEAD>
@@ -80,7 +88,7 @@ void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
       *reinterpret_cast<Vector*>(&outputs[j][v * LANES]) = sums[j][v];
   if (IS_HEAD) return;
   for (int j = 0; j < OUTPUTS; ++j)
-    for (int p = 0; p < BLOCK; ++p) outputs[j][p] = swish(outputs[j][p]);
+    for (int p = 0; p < BLOCK; ++p) outputs[j][p] = activated(outputs[j][p]);
 }
 
 // Runs a layer and those after it; returns where the last one's outputs are.

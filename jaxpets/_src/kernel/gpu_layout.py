@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from jax import Array
 
 DEPTH = 16  # of one tensor core instruction
-MAX_COLUMNS = 256
 _HALF_MAX = 65504.0
 
 IntArray: TypeAlias = npt.NDArray[np.integer[Any]]
@@ -34,6 +33,10 @@ class GpuLayout(abc.ABC):
     action_size: int
     feature_size: int
     hidden_sizes: tuple[int, ...]
+
+    most_units: ClassVar[int] = 256  # of a hidden layer
+    most_entries: ClassVar[int] = 128  # of an observation
+    most_inputs: ClassVar[int] = 256  # features and action
 
     @property
     def input_size(self) -> int:
@@ -64,12 +67,12 @@ class GpuLayout(abc.ABC):
         """Returns why no kernel has this shape, or None."""
         if not self.hidden_sizes:
             return "there is no hidden layer"
-        if self.width > MAX_COLUMNS:
-            return f"hidden layers are wider than {MAX_COLUMNS}"
-        if 2 * self.head > MAX_COLUMNS:
-            return f"observations have more than {MAX_COLUMNS // 2} entries"
-        if self.input_size > MAX_COLUMNS:
-            return f"features and action have more than {MAX_COLUMNS} entries"
+        if max(self.hidden_sizes) > self.most_units:
+            return f"hidden layers are wider than {self.most_units}"
+        if self.obs_size > self.most_entries:
+            return f"observations have more than {self.most_entries} entries"
+        if self.input_size > self.most_inputs:
+            return f"features and action have more than {self.most_inputs} entries"
         return self.misfit()
 
     @abc.abstractmethod
@@ -99,15 +102,19 @@ class GpuLayout(abc.ABC):
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
         return "\n".join(lines)
 
-    def pack(self, layers: Sequence[Mapping[str, Array]]) -> Array:
+    def pack(
+        self, layers: Sequence[Mapping[str, Array]], activation: str = "swish"
+    ) -> Array:
         """Returns weights and biases `[E, *]` of all layers, float16.
 
         Args:
           layers: `kernel` `[E, in, out]` and `bias` `[E, out]` of each, in order.
+          activation: of the hidden ones.
         """
         *hidden, head = layers
-        # The kernel computes swish(2 h) = h + h tanh(h).
-        halved = [{name: x / 2 for name, x in layer.items()} for layer in hidden]
+        # The kernel computes swish(2 h) = h + h tanh(h), and gelu much alike.
+        share = 0.5 if activation in ("swish", "gelu") else 1.0
+        halved = [{name: share * x for name, x in layer.items()} for layer in hidden]
         members = head["bias"].shape[0]
         numbers = [jnp.zeros((members, 1), jnp.float16)]
         numbers += [_numbers(layer).reshape(members, -1) for layer in (*halved, head)]

@@ -4,6 +4,7 @@
 
 #include <cuda_fp16.h>
 
+#include "gpu_activation.h"
 #include "handler.h"
 
 namespace {
@@ -20,15 +21,16 @@ __device__ __forceinline__ uint32_t pack(float low, float high) {
   return *reinterpret_cast<const uint32_t*>(&pair);
 }
 
-// swish(2 h) = h + h tanh(h). The weights are halved when they are packed.
+__device__ __forceinline__ float fast_tanh(float x) {
+  float tanh;
+  asm("tanh.approx.f32 %0, %1;" : "=f"(tanh) : "f"(x));
+  return tanh;
+}
+
 template <int REGISTERS>
-__device__ __forceinline__ void swish(float (&sums)[REGISTERS]) {
+__device__ __forceinline__ void activate(float (&sums)[REGISTERS]) {
 #pragma unroll
-  for (int i = 0; i < REGISTERS; ++i) {
-    float tanh;
-    asm("tanh.approx.f32 %0, %1;" : "=f"(tanh) : "f"(sums[i]));
-    sums[i] = fmaf(sums[i], tanh, sums[i]);
-  }
+  for (int i = 0; i < REGISTERS; ++i) sums[i] = activated(sums[i], fast_tanh);
 }
 
 // Writes the features of one particle into the input tile.

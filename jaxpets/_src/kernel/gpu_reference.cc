@@ -3,6 +3,7 @@
 
 #include <vector>
 
+#include "gpu_activation.h"
 #include "gpu_layout.h"
 // The layout comes first.
 #include "handler.h"
@@ -34,7 +35,7 @@ std::vector<float> multiply_halves(const std::vector<Half>& inputs, const Half* 
 std::vector<Half> activate(const std::vector<float>& sums) {
   std::vector<Half> activations(HIDDEN_CHUNKS * DEPTH, Half(0));
   for (int i = 0; i < WIDTH; ++i)
-    activations[i] = Half(sums[i] + sums[i] * std::tanh(sums[i]));
+    activations[i] = Half(activated(sums[i], [](float x) { return std::tanh(x); }));
   activations[WIDTH] = activations[WIDTH + 1] = Half(1);
   return activations;
 }

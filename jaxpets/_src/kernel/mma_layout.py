@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import ClassVar
 
 from jaxpets._src.kernel.gpu_layout import DEPTH, GpuLayout, chunks, round_up
 
@@ -17,11 +18,20 @@ _MOST_TILES = 5
 class MmaLayout(GpuLayout):
     """All weights stream, in the order in which they are used."""
 
+    most_units: ClassVar[int] = 512
+    most_entries: ClassVar[int] = 256
+    most_inputs: ClassVar[int] = 512
+
+    @property
+    def warps(self) -> int:
+        """Warps of a block: with twice as many a wide layer is as much for each."""
+        return 4 if super().width <= 256 else 8
+
     @property
     def width(self) -> int:
         """Columns of a hidden layer: of 64 at most 32 are for no warp alone."""
-        width = super().width
-        return width if width % 64 <= 32 else round_up(width, 64)
+        width, shared = super().width, 16 * self.warps
+        return width if width % shared <= 32 else round_up(width, shared)
 
     @property
     def left(self) -> int:
@@ -38,9 +48,13 @@ class MmaLayout(GpuLayout):
         return None
 
     def ring(self) -> Mapping[str, int]:
-        """Returns of how many tiles a block is: of as many as have room."""
+        """Returns of how many warps and tiles a block is: of as many as have room."""
         fitting = (n for n in range(_MOST_TILES, 1, -1) if self._fits(n))
-        return {"TILES": next(fitting, 1), "SHARED_MEMORY": SHARED_MEMORY}
+        return {
+            "WARPS": self.warps,
+            "TILES": next(fitting, 1),
+            "SHARED_MEMORY": SHARED_MEMORY,
+        }
 
     def _fits(self, tiles: int) -> bool:
         return self.shared_bytes(tiles) <= SHARED_MEMORY

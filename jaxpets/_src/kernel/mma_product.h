@@ -12,7 +12,6 @@
 
 namespace {
 
-constexpr int WARPS = 4;
 // Particles are in tiles of as many rows as an instruction has.
 constexpr int TILE = 16;
 
@@ -64,23 +63,23 @@ struct Share {
 using Hidden = Share<WIDTH / 16 / WARPS, WIDTH / 8 % (2 * WARPS)>;
 using Head = Share<1, 0>;
 
-// Tiles of rows in fours, for four warps: each begins with another one, by which it
-// multiplies the columns that are left over. A tile of the last, smaller four may have
-// more warps than one; the first computes what is stored.
-constexpr int FOURS = (TILES + WARPS - 1) / WARPS;
-__host__ __device__ constexpr int tiles_of(int four) {
-  return TILES - four * WARPS < WARPS ? TILES - four * WARPS : WARPS;
+// Tiles of rows in groups of as many as there are warps: each begins with another one, by
+// which it multiplies the columns that are left over. A tile of the last, smaller group
+// may have more warps than one; the first computes what is stored.
+constexpr int GROUPS = (TILES + WARPS - 1) / WARPS;
+__host__ __device__ constexpr int tiles_of(int group) {
+  return TILES - group * WARPS < WARPS ? TILES - group * WARPS : WARPS;
 }
 __device__ __forceinline__ int tile_of(int index, int warp) {
-  const int four = index / WARPS;
-  return four * WARPS + (index % WARPS + warp) % tiles_of(four);
+  const int group = index / WARPS;
+  return group * WARPS + (index % WARPS + warp) % tiles_of(group);
 }
 
 // A lane's sums: of a row +0 two columns, of the row +8 the same, then the next columns.
 template <typename Part>
 struct Sums {
   float own[TILES][Part::OWN_SUMS > 0 ? Part::OWN_SUMS : 1];
-  float rest[FOURS][Part::REST_SUMS > 0 ? Part::REST_SUMS : 1];
+  float rest[GROUPS][Part::REST_SUMS > 0 ? Part::REST_SUMS : 1];
 
   __device__ __forceinline__ void clear() {
 #pragma unroll
@@ -88,9 +87,9 @@ struct Sums {
 #pragma unroll
       for (int i = 0; i < Part::OWN_SUMS; ++i) own[tile][i] = 0.0f;
 #pragma unroll
-    for (int four = 0; four < FOURS; ++four)
+    for (int group = 0; group < GROUPS; ++group)
 #pragma unroll
-      for (int i = 0; i < Part::REST_SUMS; ++i) rest[four][i] = 0.0f;
+      for (int i = 0; i < Part::REST_SUMS; ++i) rest[group][i] = 0.0f;
   }
 };
 

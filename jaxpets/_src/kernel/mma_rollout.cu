@@ -1,13 +1,13 @@
 // A whole particle rollout in one kernel, for GPUs of compute capability 8.0 and later.
 //
-// A block owns up to 80 particles of one member for all H steps. Its four warps share the
-// columns of every layer, not the rows: each warp multiplies all particles by its own
-// weights, which so come from L2 once a step for all and need no shared memory. There lie
-// the activations, as the left operand of the next layer. A layer has two barriers: when
-// all warps have read what it overwrites, and when all have written.
+// A block owns up to 80 particles of one member for all H steps. Its four or eight warps
+// share the columns of every layer, not the rows: each warp multiplies all particles by its
+// own weights, which so come from L2 once a step for all and need no shared memory. There
+// lie the activations, as the left operand of the next layer. A layer has two barriers:
+// when all warps have read what it overwrites, and when all have written.
 //
-// A block is small enough for two of them on a multiprocessor of any GPU: while one
-// squashes, draws noise or waits, the other keeps the tensor cores busy.
+// A block of four warps is small enough for two of them on a multiprocessor of any GPU:
+// while one squashes, draws noise or waits, the other keeps the tensor cores busy.
 //
 // Operands are float16, as for Hopper; sums, the head, the state and its update float32.
 
@@ -30,7 +30,7 @@ constexpr int WIDE_WEIGHTS = DEPTH * WIDTH, HEAD_WEIGHTS = DEPTH * 2 * HEAD;
 using Block = Particles<ROWS, THREADS, STRIDE>;
 // Chunks come from L2 in the time of two or three products; if registers are left for so
 // many. These numbers are of 255.
-constexpr int SUMS = TILES * Hidden::OWN_SUMS + FOURS * Hidden::REST_SUMS;
+constexpr int SUMS = TILES * Hidden::OWN_SUMS + GROUPS * Hidden::REST_SUMS;
 constexpr int FITTING = (204 - SUMS - 4 * TILES) / Hidden::WORDS;
 constexpr int BUFFERS = FITTING < 2 ? 2 : FITTING > 4 ? 4 : FITTING;
 using HiddenStream = Stream<Hidden, WIDE_WEIGHTS, BUFFERS>;
@@ -66,14 +66,14 @@ __device__ __forceinline__ void append_ones(__half* operand, int thread) {
 // A warp's activations of a layer, rounded: two to a word, in the order of the sums.
 struct Activations {
   static constexpr int OWN = Hidden::OWN_SUMS / 2, REST = Hidden::REST_SUMS / 2;
-  uint32_t own[TILES][OWN > 0 ? OWN : 1], rest[FOURS][REST > 0 ? REST : 1];
+  uint32_t own[TILES][OWN > 0 ? OWN : 1], rest[GROUPS][REST > 0 ? REST : 1];
 
   template <int COUNT>
   static __device__ __forceinline__ void round(uint32_t* rounded, float* sums) {
 #pragma unroll
     for (int i = 0; i < COUNT; ++i) {
       float (&two)[2] = *reinterpret_cast<float (*)[2]>(sums + 2 * i);
-      swish(two);
+      activate(two);
       rounded[i] = pack(two[0], two[1]);
     }
   }
@@ -89,7 +89,7 @@ struct Activations {
 #pragma unroll
     for (int tile = 0; tile < TILES; ++tile) round<OWN>(own[tile], sums.own[tile]);
 #pragma unroll
-    for (int four = 0; four < FOURS; ++four) round<REST>(rest[four], sums.rest[four]);
+    for (int group = 0; group < GROUPS; ++group) round<REST>(rest[group], sums.rest[group]);
   }
 
   __device__ __forceinline__ void write(__half* operand, int warp, int lane) const {
@@ -100,11 +100,11 @@ struct Activations {
           place + tile_of(tile, warp) * TILE * STRIDE + warp * 16 * Hidden::PAIRS,
           own[tile]);
 #pragma unroll
-    for (int four = 0; four < FOURS; ++four)
-      if (REST > 0 && warp < tiles_of(four))
-        store<REST>(place + tile_of(four * WARPS, warp) * TILE * STRIDE +
+    for (int group = 0; group < GROUPS; ++group)
+      if (REST > 0 && warp < tiles_of(group))
+        store<REST>(place + tile_of(group * WARPS, warp) * TILE * STRIDE +
                         WARPS * 16 * Hidden::PAIRS,
-                    rest[four]);
+                    rest[group]);
   }
 };
 
@@ -146,7 +146,7 @@ __host__ __device__ __forceinline__ int blocks_of_member(const Rollout& rollout)
   return (rollout.num_candidates * rollout.particles + ROWS - 1) / ROWS;
 }
 
-__global__ __launch_bounds__(THREADS, 2) void rollout_kernel(
+__global__ __launch_bounds__(THREADS, 8 / WARPS) void rollout_kernel(
     const __grid_constant__ Rollout whole) {
   extern __shared__ __align__(16) uint8_t bytes[];
   Shared& smem = *reinterpret_cast<Shared*>(bytes);

@@ -8,3 +8,6 @@ constexpr int round_up(int x, int multiple) {
 }
 
 constexpr int INPUTS = FEATURES + ACTION;
+
+// What ACTIVATION may be, in the order of ACTIVATIONS in network.py.
+constexpr int SWISH = 0, TANH = 1, RELU = 2, GELU = 3;

@@ -2,7 +2,7 @@
 //
 // A block owns 128 particles of one member for all H steps. Two consumer warpgroups take
 // a tile of 64 each; where multiprocessors would idle, blocks own one tile. Activations
-// stay in registers: the accumulators of one layer, through swish, are the left operand
+// stay in registers: the accumulators of one layer, through their activation, are the left operand
 // of the next layer's products, and only weights come from shared memory. While one
 // warpgroup rounds and squashes, the other keeps the tensor cores busy. A member's weights
 // do not fit into shared memory: as many chunks as do stay there, the others stream from
@@ -291,7 +291,7 @@ __device__ __forceinline__ void pass_turn(int consumer) {
 }
 
 // One hidden layer. While the right half of its products runs, the left half goes
-// through swish.
+// through their activation.
 template <int TILES, int CHUNKS, int LEFT_STREAMED, int RIGHT_STREAMED, int REGISTERS>
 __device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
                                              const uint32_t (&operand)[REGISTERS],
@@ -307,11 +307,11 @@ __device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_
   pass_turn<TILES>(consumer);
   finish<1>(left);
   if (LEFT_STREAMED > 0 && RIGHT_STREAMED == 0) release(smem, left_slot);
-  swish(left);
+  activate(left);
   keep_order();
   finish<0>(right);
   if (RIGHT_STREAMED > 0) release(smem, right_slot);
-  swish(right);
+  activate(right);
   // Sums lie in registers as activations do. Rounding waits until here, since no register
   // that a product reads may be written while another product runs.
 #pragma unroll
