@@ -124,8 +124,8 @@ def _facts(file: Path, run: Path, returns: Sequence[Path] | None) -> _Facts:
         rows = [r for r in _rows(folder) if (r.seed, r.explored) == (seed, trials)]
         if rows:
             device = _device(rundir.find_json(folder / rundir.ENVIRONMENT))
-            config = exploration.config_of(RunFolder(folder))
-            performed.append(_Performed(config, device, _by_task(rows)))
+            own = exploration.config_of(RunFolder(folder))
+            performed.append(_Performed(own, device, _by_task(rows)))
         elif returns is not None:
             raise UsageError(f"{folder} has no trial of seed {seed} after {trials}.")
     explored = [row for row in _rows(run) if row.seed == seed and row.trial <= trials]

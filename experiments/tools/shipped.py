@@ -34,16 +34,16 @@ def text(name: str) -> str:
 @contextlib.contextmanager
 def _logs(name: str) -> Iterator[list[Path]]:
     """Gives the zero-shots of a model, each in the folder of what explored."""
+    laptop = sorted((RESULTS / "pretrained-laptop" / name).glob("zero-shot-???"))
     if name in _SHIPPED:
-        laptop = f"pretrained-laptop/{name}/zero-shot-060"
-        yield [RESULTS / folder for folder in (_SHIPPED[name], laptop)]
+        yield [RESULTS / _SHIPPED[name], *laptop]
         return
     run = f"best-{name.replace('/', '-')}"
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(RESULTS / _SUITE) as archive:
             own = [x for x in archive if x.name.startswith(f"./{run}/")]
             archive.extractall(folder, own, filter="data")
-        yield sorted(Path(folder, run).glob("zero-shot-*"))
+        yield [*sorted(Path(folder, run).glob("zero-shot-*")), *laptop]
 
 
 def main() -> int:

@@ -106,10 +106,15 @@ def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
     assert found == json.loads((results / "dmc20.json").read_text())
     assert suite.main([str(results / "dmc20.json"), "--peers", str(PEERS_FILE)]) == 0
     page = (results / "dmc20.md").read_text()
+    front = (results.parent / "README.md").read_text()
     for line in capsys.readouterr().out.splitlines():
         if line.startswith(("| **mean**", *(f"| {name}" for name in suite.NAMES))):
             task, epistemic, random, best, *others = line.strip("| ").split(" | ")
             assert " | ".join([task, best, epistemic, random, *others[:4]]) in page
+        if line.startswith(("| **mean**", "| the other domains")):
+            _, epistemic, random, best, *others = line.strip("| ").split(" | ")
+            random = random.replace(" (of 16)", ", of 16")
+            assert " | ".join([best, epistemic, random, *others[:3]]) in front
 
 
 def test_a_figure_is_of_the_file_of_results(tmp_path, peers):

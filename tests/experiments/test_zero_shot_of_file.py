@@ -92,6 +92,9 @@ def test_a_file_says_how_its_model_came_to_be(explored, file):
     )  # fmt: skip
     card = file.with_suffix(".md").read_text()
     assert "3 trials of 20 steps" in card and "| front-flip | " in card
+    sought = exploration.config_of(RunFolder(explored)).planner
+    assert sought.num_particles != performed.task_planner.num_particles
+    assert f"{sought.num_particles} particles and horizon {sought.horizon}.\n" in card
 
 
 def test_a_file_has_no_data_to_learn_on(file, tmp_path, capsys):
