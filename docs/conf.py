@@ -39,7 +39,7 @@ include_patterns = [
     "docs/**.md",
     "docs/**.rst",
     "experiments/README.md",
-    "jaxpets/models/*.md",
+    "jaxpets/models/**.md",
     "results/*.md",
     "results/*/report/report.md",
 ]
