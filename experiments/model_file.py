@@ -157,7 +157,8 @@ def config_of(path: Path, config: Config) -> Config:
     own = config.env if user_files.is_file(config.env) else None
     env = robot_of(model, said, own)
     training = _training(model.about)
-    arm = _arm(str(training.get("arm", config.arm)), config.arm, said)
+    arm = _arm(str(training.get("arm", config.arm)), config.arm, path)
+    user_files.check_named("--arm", config.arm, arm, path)
     given = {"seeds": [training.get("seed", 0)], "env": env, "arm": arm}
     for name in ("num_trials", "trial_length"):
         given |= {name: training[name]} if name in training else {}
@@ -186,12 +187,12 @@ def _training(about: Mapping[str, Any]) -> Mapping[str, Any]:
     return training if isinstance(training, dict) else {}
 
 
-def _arm(said: str, given: str, where: str) -> str:
+def _arm(said: str, given: str, where: Path) -> str:
     """Returns the arm that explored; one of a user's file is known by its label."""
     if said == rundir.label(given):
         return given
     try:
-        return from_json({"arm": said}, Config(), where).arm
+        return from_json({"arm": said}, Config(), str(where)).arm
     except CheckpointError as error:
         words = f"{where} was explored by an arm of its own, {said!r}: name its file"
         raise UsageError(f"--arm is missing; {words}.") from error

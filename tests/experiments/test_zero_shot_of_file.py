@@ -133,6 +133,7 @@ def again(file, path, **changes):
         ({"environment": None}, 2, "does not say of which robot it is"),
         ({"environment": "gym/Ant-v5"}, 2, "is of another robot"),
         ({"environment": "evil.py"}, 2, "runs only if you name it: --env evil.py"),
+        ({"training": {"arm": "evil.py:arm"}}, 2, "you name it: --arm evil.py:arm"),
         ({"training": {"arm": "mine"}}, 2, "an arm of its own, 'mine': name its file"),
         ({"training": {"num_trials": "x"}}, 3, "num_trials is 'x', not 1 to"),
         ({"training": {"seed": -1}}, 3, "seeds is [-1], not a list"),
