@@ -53,10 +53,12 @@ class ModelFile(NamedTuple):
 
     def restore_trial(self, trial: int, template: Any, *, part: bool) -> Any:
         """Returns a learner `[S]` that has the model of one seed, and nothing else."""
+        from . import exploration  # it brings MuJoCo and orbax, as RunFolder does
+
         del trial, part
-        form = template({}) if callable(template) else template
+        form: Any = template({}) if callable(template) else template
         params = jax.tree.map(lambda x: x[None], read(self.path, str(self.path)).params)
-        return jax.tree.map(lambda _: None, form)._replace(params=params)
+        return exploration.model_of(form._replace(params=params))
 
 
 Source: TypeAlias = "RunFolder | ModelFile"  # what a later phase starts from
@@ -157,8 +159,7 @@ def config_of(path: Path, config: Config) -> Config:
     own = config.env if user_files.is_file(config.env) else None
     env = robot_of(model, said, own)
     training = _training(model.about)
-    arm = _arm(str(training.get("arm", config.arm)), config.arm, path)
-    user_files.check_named("--arm", config.arm, arm, path)
+    arm = _arm_of(model, config.arm)
     given = {"seeds": [training.get("seed", 0)], "env": env, "arm": arm}
     for name in ("num_trials", "trial_length"):
         given |= {name: training[name]} if name in training else {}
@@ -187,15 +188,22 @@ def _training(about: Mapping[str, Any]) -> Mapping[str, Any]:
     return training if isinstance(training, dict) else {}
 
 
-def _arm(said: str, given: str, where: Path) -> str:
-    """Returns the arm that explored; one of a user's file is known by its label."""
+def _arm_of(model: Model, given: str) -> str:
+    """Returns the arm that explored; one of a user's file is known by its label.
+
+    Raises:
+      UsageError: if it is of a file that the command line does not name.
+    """
+    said = str(_training(model.about).get("arm", given))
     if said == rundir.label(given):
         return given
     try:
-        return from_json({"arm": said}, Config(), str(where)).arm
+        arm = from_json({"arm": said}, Config(), str(model.path)).arm
     except CheckpointError as error:
-        words = f"{where} was explored by an arm of its own, {said!r}: name its file"
-        raise UsageError(f"--arm is missing; {words}.") from error
+        words = f"{model.path} was explored by an arm of its own, {said!r}"
+        raise UsageError(f"--arm is missing; {words}: name its file.") from error
+    user_files.check_named("--arm", given, arm, model.path)
+    return arm
 
 
 def _sizes(model: Model, said: str) -> ModelConfig:
