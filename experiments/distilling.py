@@ -146,7 +146,7 @@ def _template(now: _Run) -> State:
 def _explored(now: _Run, source: Source) -> State:
     """Returns the model, after a refit if one is asked for, and the data behind it."""
     config, parts = now.config, now.parts
-    saved = exploration.as_saved(config, parts)
+    saved = exploration.learned(config, parts)
 
     def form(leaves: Mapping[str, Any]) -> State:
         whole = saved(leaves)

@@ -108,6 +108,16 @@ def as_saved(config: Config, parts: Parts) -> Callable[[Mapping[str, Any]], Stat
     return saved
 
 
+def learned(config: Config, parts: Parts) -> Callable[[Mapping[str, Any]], State]:
+    """Returns what `as_saved` does, without the reward data: a part of a checkpoint.
+
+    They are what exploration sought, which may be one of tasks that are not those of
+    phase 2.
+    """
+    saved = as_saved(config, parts)
+    return lambda leaves: saved(leaves)._replace(reward=())
+
+
 def with_room(
     state: State, capacity: int, reward_data: jaxpets.RewardData | None = None
 ) -> State:

@@ -238,7 +238,8 @@ def finetune(
         task_ids=robots.places(robot, tasks),
         explored=step,
     )  # fmt: skip
-    state = source.restore_trial(step, exploration.as_saved(config, parts))
+    learner = exploration.learned(config, parts)
+    state = source.restore_trial(step, learner, part=True)
     if parts.refitter and not run.steps():
         state = refit(config, parts, state, step, run)
     capacity = state.dataset.data.obs.shape[1]

@@ -52,7 +52,8 @@ def prepared(
     if found := run.restore(form):
         return found[1]
     if parts.refitter or parts.critic:
-        state = source.restore_trial(step, exploration.as_saved(config, parts))
+        learner = exploration.learned(config, parts)
+        state = source.restore_trial(step, learner, part=True)
         if parts.refitter:
             state = refitted(config, parts, state, source, step, run)
         model = exploration.model_of(state)

@@ -3,11 +3,13 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from experiments import exploration
 from experiments.build import build
 from experiments.presets import PRESETS
+from experiments.storage.folder import RunFolder
 
 
 def describe(tree):
@@ -37,3 +39,13 @@ def test_a_learner_gets_room_for_more_trials(arm):
     found = exploration.as_saved(config, parts)(leaves)
     assert describe(found) == describe(large)
     assert describe(exploration.as_saved(config, parts)({})) == describe(small)
+
+
+def test_tasks_need_not_be_those_that_exploration_sought(tmp_path):
+    config = dataclasses.replace(PRESETS["smoke"], arm="oracle", engine="mujoco")
+    sought = exploration.template(config, build(config))
+    whole = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), sought)
+    RunFolder(tmp_path).save(3, whole._replace(reward={"of": jnp.ones(2)}))
+    form = exploration.learned(config, build(config))
+    found = RunFolder(tmp_path).restore_trial(3, form, part=True)
+    assert describe(found) == describe(sought._replace(reward=()))
