@@ -13,12 +13,10 @@ nll: negative log-likelihood in nats per dimension of the equal mixture of the m
 Targets are what the model of the robot predicts: changes, of most entries.
 """
 
-import argparse
-import functools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,28 +24,13 @@ import numpy as np
 from jax import Array
 
 import jaxpets
-from jaxpets.envs import Robot
 
-from .. import exploration, robots
-from ..build import State, build
-from ..config import Config
-from ..entries import to_json
-from ..errors import RunError, UsageError
+from .. import robots
 from ..report import tables
-from ..storage import metrics, rundir
-from ..storage.folder import RunFolder
+from . import compared
 
 # `Ensemble.predict`.
 Predict = Callable[[jaxpets.EnsembleParams, Array, Array], tuple[Array, Array]]
-
-
-class Explored(NamedTuple):
-    """The models of a run after one of its trials, and a draw of what they saw."""
-
-    predict: Predict
-    params: jaxpets.EnsembleParams  # [S]
-    data: jaxpets.Transition  # [S, B, *]
-    trial: int
 
 
 def measure(
@@ -68,86 +51,24 @@ def measure(
     Raises:
       RunError: if the runs cannot be compared or read, or have too few transitions.
     """
-    if num_rows < 1:
-        raise UsageError(f"--rows {num_rows} is not valid; it must be 1 or more.")
-    configs = [exploration.config_of(RunFolder(run)) for run in runs]
-    labels = [_label(config) for config in configs]
-    _check_comparable(runs, configs, labels)
-    configs = [
-        exploration.without_files(config, env, run)
-        for config, run in zip(configs, runs, strict=True)
-    ]
-    # The random trials of a seed are the same in all arms: all models know them.
-    shared = max(config.random_trials for config in configs)
-    found = [
-        _read(run, config, at_trial, shared * config.trial_length, num_rows)
-        for run, config in zip(runs, configs, strict=True)
-    ]
-    error, nll = _score_all(robots.of(configs[0]), found, configs)
-    arms = [
-        arm for arm, config in zip(labels, configs, strict=True) for _ in config.seeds
-    ]
-    trials: dict[str, dict[int, int]] = {}
-    for arm, config, run in zip(labels, configs, found, strict=True):
-        trials.setdefault(arm, {}).update(dict.fromkeys(config.seeds, run.trial))
+    compared.check_positive("--rows", num_rows)
+
+    def transitions(saved: compared.Saved) -> jaxpets.Transition:
+        size = int(saved.dataset.size)
+        compared.check_enough(saved, num_rows, size - saved.first, "transitions")
+        seeds = saved.config.seeds
+        return draw(saved.dataset.data, seeds, saved.first, size, num_rows)
+
+    found = compared.read(runs, at_trial, env, transitions)
+    data, space = compared.joined(found), robots.of(found[0].config).space
+    scale = jnp.std(space.target(data.obs, data.next_obs), axis=(0, 1))
+    error, nll = compared.score_all(found, _score_of, data, scale)
+    arms = compared.arms_of(found)
     return {
-        "preset": rundir.study(to_json(configs[0])),
-        "rows": num_rows,
-        "trials": trials,
+        **compared.heading(found, num_rows),
         "error": by_arm(error, arms),
         "nll": by_arm(nll, arms),
     }
-
-
-def _label(config: Config) -> str:
-    return metrics.arm_label(config.arm, to_json(config))
-
-
-def _check_comparable(
-    runs: Sequence[Path], configs: Sequence[Config], labels: Sequence[str]
-) -> None:
-    """Refuses runs of several presets, and a seed of an arm that is there twice."""
-    presets = sorted({rundir.study(to_json(config)) for config in configs})
-    if len(presets) > 1:
-        raise UsageError(f"the runs are of presets {', '.join(presets)}; give one.")
-    seen: dict[tuple[str, int], Path] = {}
-    for run, config, arm in zip(runs, configs, labels, strict=True):
-        for seed in config.seeds:
-            if (arm, seed) in seen:
-                raise UsageError(
-                    f"{seen[arm, seed]} and {run} both hold seed {seed} of arm {arm}; "
-                    "leave one of them out."
-                )
-            seen[arm, seed] = run
-
-
-def _read(
-    run: Path, config: Config, at_trial: int | None, first: int, num_rows: int
-) -> Explored:
-    """Restores the models of a run and draws transitions from row `first` on."""
-    parts = build(config)
-    saved = exploration.as_saved(config, parts)
-
-    def template(leaves: Mapping[str, Any]) -> State:
-        whole = saved(leaves)
-        return exploration.model_of(whole)._replace(dataset=whole.dataset)
-
-    folder = RunFolder(run)
-    if at_trial is None:
-        found = folder.restore(template, part=True)
-    else:
-        found = at_trial, folder.restore_trial(at_trial, template, part=True)
-    if found is None:
-        raise UsageError(f"there is no checkpoint in {run}.")
-    trial, state = found
-    size = int(state.dataset.size)
-    if size - first < num_rows:
-        raise UsageError(
-            f"--rows {num_rows} is not valid; {run} has {max(size - first, 0)} "
-            f"transitions a seed after the random trials, at trial {trial}."
-        )
-    data = draw(state.dataset.data, config.seeds, first, size, num_rows)
-    return Explored(parts.model.predict, state.params, data, trial)
 
 
 def draw(
@@ -171,21 +92,8 @@ def draw(
     return jax.vmap(one)(jnp.array(seeds, jnp.uint32), data)
 
 
-def _score_all(
-    robot: Robot, found: Sequence[Explored], configs: Sequence[Config]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns error and nll `[M, M]` of all models on the data of all."""
-    data = jax.tree.map(lambda *x: jnp.concatenate(x), *(run.data for run in found))
-    target = robot.space.target(data.obs, data.next_obs)
-    scale = jnp.std(target, axis=(0, 1))
-    programs: dict[Any, Any] = {}  # runs with networks of one size share one
-    scores = []
-    for run, config in zip(found, configs, strict=True):
-        program = functools.partial(score, run.predict, config.model.num_members)
-        program = programs.setdefault(config.model, jax.jit(program))
-        scores.append(jax.device_get(program(run.params, data, scale)))
-    error, nll = (np.concatenate(x) for x in zip(*scores, strict=True))
-    return error, nll
+def _score_of(model: jaxpets.Ensemble, *inputs: Any) -> tuple[Array, Array]:
+    return score(model.predict, model.num_members, *inputs)
 
 
 def score(
@@ -245,36 +153,18 @@ def _summary(values: np.ndarray) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and writes a JSON file; returns the exit code, as `experiments.run`."""
-    parser = argparse.ArgumentParser(
-        prog=f"{__package__}.model_error",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "runs", type=Path, nargs="+", metavar="RUN", help="folder of an exploration run"
-    )
+    parser = compared.parser("model_error", __doc__)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE",
         help="JSON; the report shows OUT/model_error.json",
     )  # fmt: skip
     parser.add_argument(
-        "--at-trial", type=int, help="as all runs were after this trial; else the last"
-    )
-    parser.add_argument(
         "--rows", type=int, default=2000, help="transitions of every seed (2000)"
     )
-    parser.add_argument("--env", help="the robot of the runs, if it is of a file")
     args = parser.parse_args(argv)
-    try:
-        if not args.out.parent.is_dir():
-            raise UsageError(f"--out {args.out} is not valid; there is no such folder.")
-        found = measure(args.runs, args.rows, args.at_trial, args.env)
-        rundir.write_json(args.out, found)
-    except RunError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
-    print(f"wrote {args.out}")
-    return 0
+    return compared.write(
+        args.out, lambda: measure(args.runs, args.rows, args.at_trial, args.env)
+    )
 
 
 if __name__ == "__main__":
