@@ -29,11 +29,11 @@ Ceilings = dict[str, float]  # of a step, by task
 
 
 class _Trial(msgspec.Struct):
-    """What is read of a trial of the simulator."""
+    """What is read of a trial of the simulator; it has no return if physics diverged."""
 
     task: str
     steps: Annotated[int, msgspec.Meta(gt=0)]
-    reward: float = msgspec.field(name="return")
+    reward: float | None = msgspec.field(name="return")
 
 
 _TRIAL = msgspec.json.Decoder(_Trial)
@@ -72,7 +72,8 @@ def ceilings(path: Path) -> Ceilings:
     try:
         lines = path.read_bytes().splitlines()
         for trial in map(_TRIAL.decode, lines):
-            found.setdefault(trial.task, []).append(trial.reward / trial.steps)
+            if trial.reward is not None:
+                found.setdefault(trial.task, []).append(trial.reward / trial.steps)
     except (OSError, msgspec.MsgspecError) as error:
         raise UsageError(f"{path} has no trials of the simulator: {error}") from error
     return {task: float(np.mean(rewards)) for task, rewards in found.items()}

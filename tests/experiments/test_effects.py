@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import tarfile
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -90,6 +91,46 @@ def _without(path, task):
     lines = [line for line in path.read_text().splitlines() if task not in line]
     path.write_text("\n".join(lines))
     return path
+
+
+def test_a_trial_whose_physics_diverged_is_no_ceiling(tmp_path):
+    path = tmp_path / "simulator.jsonl"
+    rows = [{"task": "jump", "return": x, "steps": 10} for x in (20, None)]
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert effects.ceilings(path) == {"jump": 2.0}
+
+
+def test_the_study_is_what_its_logs_say(tmp_path, capsys):
+    root = Path(__file__).parents[2]
+    study = root / "results" / "study"
+    for path in study.glob("*.tar.xz"):
+        if path.name != "stopped.tar.xz":
+            with tarfile.open(path) as logs:
+                logs.extractall(tmp_path, filter="data")
+    found = tmp_path / "found.json"
+    flags = ["--ceilings", str(study / "simulator.jsonl"), "--json", str(found)]
+    assert effects.main([str(tmp_path), *flags]) == 0
+    assert json.loads(found.read_text()) == json.loads(
+        (root / "results" / "study.json").read_text()
+    )
+    page = (root / "results" / "study.md").read_text().splitlines()
+    cells = {}
+    for variant in capsys.readouterr().out.split("## ")[1:]:
+        tag, *lines = variant.splitlines()
+        for line in lines:
+            if tag == "refit-icem" or line.startswith("| `"):
+                assert line in page
+            if line.startswith("| `") and not tag.startswith("one"):
+                arm, _, held_out, *_ = line.strip("| ").split(" | ")
+                cells[tag, arm.strip("`")] = held_out
+    front = (root / "README.md").read_text().splitlines()
+    arms = ("best", "epistemic", "info-gain", "random")
+    for words, tag in (
+        ("the paper's CEM, no refit", "cem"),
+        ("iCEM, after a refit", "refit-icem"),
+    ):
+        row = [cells.get((tag, arm), "not run") for arm in arms]
+        assert f"| {words} | {' | '.join(row)} |" in front
 
 
 def test_the_interval_of_an_iqm_draws_seeds_within_tasks():
