@@ -29,7 +29,7 @@ Ceilings = dict[str, float]  # of a step, by task
 
 
 class _Trial(msgspec.Struct):
-    """What is read of a trial of the simulator; it has no return if physics diverged."""
+    """What is read of a trial of the simulator; no return if physics diverged."""
 
     task: str
     steps: Annotated[int, msgspec.Meta(gt=0)]
