@@ -139,10 +139,14 @@ class PlannerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CriticConfig:
-    """An actor and a critic of every task, which learn in imagination for zero-shot."""
+    """An actor and a critic that learn in imagination: of every task for zero-shot.
+
+    A policy that is distilled begins as an actor of all tasks.
+    """
 
     num_updates: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
-    """Gradient steps, at least; 0: no critic, a plan ends with its horizon."""
+    """Gradient steps, at least; 0: no critic, a plan ends with its horizon, and a
+    policy begins with the planner."""
     acts: bool = False
     """The actor acts alone: nothing is planned."""
     learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
@@ -171,8 +175,9 @@ class CriticConfig:
 class DistillingConfig:
     """A policy for all tasks that acts as the planner would, without a plan."""
 
-    num_rounds: Annotated[int, Meta(ge=1, le=10_000)] = 10
-    """Times that the planner is asked, the policy learns and then acts."""
+    num_rounds: Annotated[int, Meta(ge=0, le=10_000)] = 10
+    """Times that the planner is asked, the policy learns and then acts. 0: it stays as
+    it was imagined, with --critic.num-updates."""
     num_trials: Annotated[int, Meta(ge=1, le=10_000)] = DistillConfig.num_trials
     """Imagined trials side by side in which the planner is asked, at least."""
     horizon: Annotated[int, Meta(ge=1, le=100_000)] = 250

@@ -23,9 +23,13 @@ _STEPS = 1000
 
 
 def make_critic(
-    config: Config, robot: Robot, model: jaxpets.Ensemble, terminal_fn: TerminalFn
-) -> ActorCritic:
-    """Returns the actor and the critic of a task, which imagine with this model."""
+    config: Config, robot: Robot, model: jaxpets.Ensemble, terminal_fn: TerminalFn,
+    goals: Goals | None = None,
+) -> ActorCritic:  # fmt: skip
+    """Returns the actor and the critic of a task, which imagine with this model.
+
+    With goals they are of all tasks that these draw.
+    """
     settings, env = config.critic, robot.env
     count, steps = calls(config)
     rate = optax.cosine_decay_schedule(
@@ -42,7 +46,7 @@ def make_critic(
         action_low=env.action_low,
         action_high=env.action_high,
         num_members=model.num_members,
-        goals=goals(robot),
+        goals=goals_of(robot) if goals is None else goals,
         terminal_fn=terminal_fn,
     )
 
@@ -53,7 +57,7 @@ def calls(config: Config) -> tuple[int, int]:
     return count, -(-config.critic.num_updates // count)
 
 
-def goals(robot: Robot) -> Goals:
+def goals_of(robot: Robot) -> Goals:
     """Returns what is drawn for a trial of a task, which its networks have to see."""
     start = jax.eval_shape(robot.env.reset, jax.random.key(0))
     if not jax.tree.leaves(start.constants):

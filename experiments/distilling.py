@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import PartitionSpec as P
@@ -23,7 +22,7 @@ import jaxpets
 from jaxpets.envs import Tasks
 from jaxpets.policies import ActorCriticParams, Distiller, Guided
 
-from . import acting, cost, exploration, records, robots
+from . import acting, cost, exploration, imagined_policy, records, robots, seen
 from .acting import Actors, Scorer, Trials
 from .build import DISTILL, Parts, State, build, key_per, trial_keys
 from .config import Config
@@ -80,7 +79,7 @@ def distill(
         return
     parts = build(config)
     say_rollout(run, parts.performed_by)
-    turns = config.distill.num_rounds
+    turns = max(config.distill.num_rounds, 1)
     learned_before = bool(run.steps())
     length = (3 if learned_before else turns + 2) * config.task_length
     progress = Progress(length, 0, "distill", watch)
@@ -135,7 +134,8 @@ def _template(now: _Run) -> State:
     """Returns the model with the networks of its policy, `[S]`, as shapes."""
     explored = exploration.template(now.config, now.parts)
     params = jaxpets.PlanParams(explored.params, now.tasks.params)
-    dataset = jax.eval_shape(functools.partial(_empty, now, 1))
+    seeds = len(now.config.seeds)
+    dataset = jax.eval_shape(functools.partial(seen.empty, now.parts, seeds, 1))
     begun = jax.eval_shape(
         acting.over(now.distiller.init, (_KNOWN, _SEEDS, _SEEDS), SEED),
         params, now.keys(0), dataset,
@@ -163,18 +163,30 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     settings = now.config.distill
     begin = time.monotonic()
     place = functools.partial(devices.place, now.placement)
-    dataset = place(_room(now, state, planned), SEED)
+    seeds, *trials, length, _ = planned.transitions.obs.shape
+    more = max(settings.num_rounds - 1, 0) * len(now.tasks.names)
+    count = int(np.prod(trials)) + more
+    dataset = place(seen.room(now.parts, state, seeds, count * length), SEED)
     params = jaxpets.PlanParams(place(state.params, SEED), now.tasks.params)
-    append = _program(now, _append, (_SEEDS, _SEEDS), _SEEDS)
+    append = _program(now, seen.append, (_SEEDS, _SEEDS), _SEEDS)
     init = _program(now, now.distiller.init, (_KNOWN, _SEEDS, _SEEDS), _SEEDS)
     learn = _program(
         now, now.distiller.step, (_KNOWN, _SEEDS, _SEEDS, _SEEDS), (_SEEDS, _SEEDS),
         donate_argnums=2,
     )  # fmt: skip
     dataset = append(dataset, place(planned.transitions, SEED))
-    # With the keys of a place that no task has: those of tasks are for trials.
+    # With the keys of places that no task has: those of tasks are for trials.
     apart = [len(now.parts.robot.tasks.names)]
     learned = init(params, place(now.keys(0, apart)[..., 0], SEED), dataset)
+    if now.config.critic.num_updates:
+        keys = place(now.keys(0, [apart[0] + 1])[..., 0], SEED)
+        own = imagined_policy.learned(
+            now.config, now.parts, now.tasks, now.placement, params, keys, dataset,
+            now.folder,
+        )  # fmt: skip
+        own = place(own, SEED)
+        begun = learned.params._replace(actor=own.actor, mean=own.mean, std=own.std)
+        learned = learned._replace(params=begun)
     for turn in range(1, settings.num_rounds + 1):
         keys = now.keys(turn, apart)[..., 0]
         learned, metrics = learn(params, place(keys, SEED), learned, dataset)
@@ -196,44 +208,6 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     plans = settings.num_rounds * settings.horizon * settings.num_trials
     now.folder.say(f"distilled {plans:,} plans of each seed  {seconds:.1f} s")
     return devices.collect(now.placement, learned.params, SEED)
-
-
-def _room(now: _Run, state: State, planned: Trials) -> jaxpets.typing.Dataset:
-    """Returns the data `[S]` that there are, with room for what will be seen.
-
-    Seeds have sizes of their own here: where physics diverges, a trial is shorter.
-    """
-    seeds, *trials, length, _ = planned.transitions.obs.shape
-    rounds, count = now.config.distill.num_rounds, len(now.tasks.names)
-    more = length * (int(np.prod(trials)) + (rounds - 1) * count)
-    if not jax.tree.leaves(state.dataset):
-        return _empty(now, more)
-    capacity = state.dataset.data.obs.shape[1] + more
-    dataset = exploration.with_room(state, capacity).dataset
-    size, cursor = (jnp.repeat(x, seeds) for x in (dataset.size, dataset.cursor))
-    return dataset._replace(size=size, cursor=cursor)
-
-
-def _empty(now: _Run, capacity: int) -> jaxpets.typing.Dataset:
-    """Returns data `[S]` without a row."""
-    sizes = (now.parts.model.obs_size, now.parts.model.action_size)
-    dataset, seeds = jaxpets.datasets.init(capacity, *sizes), len(now.config.seeds)
-    return jax.tree.map(lambda x: jnp.repeat(x[None], seeds, axis=0), dataset)
-
-
-def _append(
-    dataset: jaxpets.typing.Dataset, new: jaxpets.Transition
-) -> jaxpets.typing.Dataset:
-    """Returns the data of a seed with trials `[K, R, T, *]`, one after the other."""
-
-    def one(
-        dataset: jaxpets.typing.Dataset, trial: jaxpets.Transition
-    ) -> tuple[jaxpets.typing.Dataset, None]:
-        kept = jaxpets.datasets.num_stable(trial)
-        return jaxpets.datasets.append(dataset, trial, kept), None
-
-    trials = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), new)
-    return jax.lax.scan(one, dataset, trials)[0]
 
 
 def _perform(now: _Run, who: str, state: State, turn: int, count: int) -> Trials:

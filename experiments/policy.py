@@ -30,10 +30,11 @@ from .storage.folder import RunFolder
 def make_distiller(config: Config, parts: Parts, tasks: Tasks) -> Distiller:
     """Returns what learns from the planner of a config."""
     settings, robot = config.distill, parts.robot
+    rounds = max(settings.num_rounds, 1)
     rate = optax.cosine_decay_schedule(
-        settings.learning_rate, settings.num_rounds * settings.num_updates, alpha=0.05
+        settings.learning_rate, rounds * settings.num_updates, alpha=0.05
     )
-    plans = settings.num_rounds * settings.num_trials * settings.horizon
+    plans = rounds * settings.num_trials * settings.horizon
     return jaxpets.distill(
         parts.with_policy,
         parts.model.sample,
@@ -61,7 +62,7 @@ def family(robot: Robot, count: int) -> Goals:
 
     A task that is a number among several is seen as which of them it is.
     """
-    own, every = critic.goals(robot), len(robot.tasks.names)
+    own, every = critic.goals_of(robot), len(robot.tasks.names)
     form = jax.tree.structure(robot.tasks.params)
 
     def draw(tasks: Any, key: Array) -> Any:

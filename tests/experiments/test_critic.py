@@ -82,9 +82,9 @@ def test_what_is_drawn_for_a_trial_is_seen():
     reacher, walker = (
         robots.named(f"dmc/{x}", "mujoco") for x in ("reacher", "walker")
     )
-    assert critic.goals(walker).features(()).shape == (0,)
+    assert critic.goals_of(walker).features(()).shape == (0,)
     task = jax.tree.map(lambda x: x[0], reacher.tasks.params)
-    goals = critic.goals(reacher)
+    goals = critic.goals_of(reacher)
     drawn = [goals.draw(task, jax.random.key(i)) for i in (0, 1)]
     seen = [goals.features(x) for x in drawn]
     assert seen[0].shape == (2,) and not np.allclose(*seen)

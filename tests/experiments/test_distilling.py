@@ -65,6 +65,28 @@ def test_a_stopped_run_performs_with_what_it_had_learned(explored, capsys):
     assert runs.rows(folder) == before
 
 
+@pytest.mark.slow
+def test_a_policy_can_be_imagined_before_a_planner_is_asked(explored, capsys):
+    flags = ("--critic.num-updates", "5", "--critic.batch-size", "6")
+    alone = ("--distill.num-rounds", "0", "--tag", "imagined")
+    said = distilled(explored, capsys, *flags, *alone)
+    assert "imagined policy: 5 gradient steps" in said
+    assert "distilled 0 plans" in said and "distill 1/" not in said
+    rows = runs.rows(explored / f"{FOLDER}-imagined")
+    assert [row["planner"] for row in rows[::4]] == ["plan", "policy", "both"]
+    said = distilled(explored, capsys, *flags, "--tag", "begun")
+    assert "imagined policy" in said and "distill 2/2  off the planner by" in said
+    first, then = (
+        load_policy(explored / f"{FOLDER}-{tag}" / "policy-0.safetensors")[1]
+        for tag in ("imagined", "begun")
+    )
+    # The rounds go on from what was imagined: they see alike, and have moved.
+    np.testing.assert_allclose(first.mean, then.mean, atol=1e-6)  # of sums in any order
+    weights = [np.concatenate([*map(np.ravel, jax.tree.leaves(x.actor))])
+               for x in (first, then)]  # fmt: skip
+    assert 0.0 < np.abs(weights[0] - weights[1]).max() < 0.5
+
+
 def test_a_planner_that_earns_nothing_has_no_share():
     """As with a sparse reward; the run is complete all the same."""
     rows = [
@@ -90,10 +112,10 @@ def test_a_task_is_seen_by_its_weights_or_as_one_of_several():
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--critic.num-updates", "5"), "--critic.num-updates 5 is not valid"),
+        (("--critic.num-updates", "5", "--critic.acts"), "--critic.acts True is not"),
         (("--distill.num-rounds", "0"), "--distill.num-rounds 0 is not valid"),
     ],
-    ids=["critic", "rounds"],
+    ids=["acts", "rounds"],
 )
 def test_what_cannot_be_is_refused(explored, capsys, flags, words):
     assert main([*PHASE, *flags, "--from", str(explored), "--tag", "refused"]) == 2
