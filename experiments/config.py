@@ -139,14 +139,10 @@ class PlannerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CriticConfig:
-    """An actor and a critic that learn in imagination: of every task for zero-shot.
-
-    A policy that is distilled begins as an actor of all tasks.
-    """
+    """An actor and a critic of every task, or of all for distill, that imagine."""
 
     num_updates: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
-    """Gradient steps, at least; 0: no critic, a plan ends with its horizon, and a
-    policy begins with the planner."""
+    """Gradient steps, at least; 0: no critic, a plan ends with its horizon."""
     acts: bool = False
     """The actor acts alone: nothing is planned."""
     learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
@@ -176,8 +172,7 @@ class DistillingConfig:
     """A policy for all tasks that acts as the planner would, without a plan."""
 
     num_rounds: Annotated[int, Meta(ge=0, le=10_000)] = 10
-    """Times that the planner is asked, the policy learns and then acts. 0: it stays as
-    it was imagined, with --critic.num-updates."""
+    """Times that the planner is asked, the policy learns and acts; 0: as imagined."""
     num_trials: Annotated[int, Meta(ge=1, le=10_000)] = DistillConfig.num_trials
     """Imagined trials side by side in which the planner is asked, at least."""
     horizon: Annotated[int, Meta(ge=1, le=100_000)] = 250

@@ -80,6 +80,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--env", help="the robot; by default that of the model")
     add("--seed", type=int, help="of a run with several; by default the first")
     add(
+        "--policy", type=Path, metavar="FILE",
+        help="policy-SEED.safetensors of distill, which can act in place of the plans",
+    )  # fmt: skip
+    add(
         "--horizon", type=_steps, metavar="STEPS",
         help="planned ahead, by default as the model says; fewer are quicker",
     )  # fmt: skip

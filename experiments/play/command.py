@@ -18,6 +18,7 @@ from jaxpets.envs import Robot, with_constants
 
 TASK, FORMULA, EXPLORE = 0, 1, 2
 TO_EXPLORE = "explore"
+PLAN, POLICY = "plan", "policy"
 
 # What the tasks of a robot say in words, where they can be said so.
 _TEXTS: Mapping[str, Mapping[str, str]] = {
@@ -106,6 +107,7 @@ class Command(NamedTuple):
       problem: why the line is no reward; the one in force is then an older one. "" if
         it is.
       column: where in the line, from 0.
+      acts: who does, PLAN or POLICY.
     """
 
     reward: Any
@@ -113,11 +115,21 @@ class Command(NamedTuple):
     line: str
     problem: str = ""
     column: int = 0
+    acts: str = PLAN
 
     @property
     def label(self) -> str:
         """What is wanted, in words."""
         return self.name or self.line
+
+    @property
+    def is_for_policy(self) -> bool:
+        """Whether a policy shall act, and is asked for what it can know: a task."""
+        return self.acts == POLICY and self.name not in ("", TO_EXPLORE)
+
+    def asks(self, reward: RewardChoice, name: str, line: str) -> "Command":
+        """Returns the command with something else that is wanted."""
+        return Command(reward, name, line, acts=self.acts)
 
 
 NOTHING = Command(None, "", "")
@@ -152,13 +164,13 @@ class Commands:
         """Returns what a button asks for: a task, or to explore; else what was."""
         if name == TO_EXPLORE:
             choice = command.reward._replace(kind=jnp.int32(EXPLORE))
-            return Command(choice, name, "")
+            return command.asks(choice, name, "")
         if name not in self.tasks:
             return command
         place = self._robot.tasks.names.index(name)
         task = jax.tree.map(lambda x: x[place], self._robot.tasks.params)
         choice = command.reward._replace(kind=jnp.int32(TASK), task=task)
-        return Command(choice, name, self.tasks[name])
+        return command.asks(choice, name, self.tasks[name])
 
     def by_text(self, command: Command, text: str) -> Command:
         """Returns what a line asks for; if it is no reward, what was, and why."""
@@ -168,7 +180,7 @@ class Commands:
             problem = {"problem": error.message, "column": error.column}
             return command._replace(line=text, **problem)
         choice = command.reward._replace(kind=jnp.int32(FORMULA), formula=formula)
-        return Command(choice, "", text)
+        return command.asks(choice, "", text)
 
     def by_sliders(
         self, command: Command, values: Sequence[float], effort: float

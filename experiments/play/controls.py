@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import viser
 
 from . import readout
-from .command import Command, Commands
+from .command import PLAN, POLICY, Command, Commands
 from .session import MEMORY, Session
 
 _SPEEDS: Mapping[str, float] = {"1": 1.0, "1/2": 0.5, "1/4": 0.25, "1/10": 0.1}
@@ -41,7 +41,7 @@ class Values(NamedTuple):
 class Press(NamedTuple):
     """A button that was pressed: of which group, and which of it."""
 
-    group: str  # "reward", "time", "speed" or "push"
+    group: str  # "reward", "acts", "time", "speed" or "push"
     name: str
 
 
@@ -85,6 +85,8 @@ class Controls:
         match press:
             case Press("reward", name) if self._commands is not None:
                 return self._commands.by_name(command, name)
+            case Press("acts", name) if name in (PLAN, POLICY):
+                return command._replace(acts=name)
             case Press("push", name):
                 session.push(name)
             case Press("speed", name):

@@ -14,6 +14,7 @@ from jax import Array
 import jaxpets
 from jaxpets import rewards
 from jaxpets.envs import Robot
+from jaxpets.policies import ActorCriticParams, Guided
 
 from ..acting import at_start
 from .command import Command, RewardChoice, bound, earned_of, reward_of
@@ -35,6 +36,13 @@ class World(NamedTuple):
     planner: Any
     number: Array
     qpos: Array
+
+
+class Policy(NamedTuple):
+    """What acts without a plan; its reward data are Guided."""
+
+    planner: jaxpets.Planner
+    networks: ActorCriticParams
 
 
 class Plan(NamedTuple):
@@ -68,6 +76,7 @@ class Live:
         *,
         horizon: int,
         terminal_fn: Callable[[Any, Array], Array] | None = None,
+        policy: Policy | None = None,
     ) -> None:
         self.step_time = robot.step_time
         reset = jax.eval_shape(robot.env.reset, jax.random.key(0))
@@ -81,6 +90,7 @@ class Live:
         )
         self._start = jax.jit(_start(robot, planner))
         self._plan = jax.jit(_plan(robot, rollout, planner, horizon))
+        self._decide = jax.jit(_decide(policy)) if policy else None
         self._step = jax.jit(_step(robot))
 
     def start(self, command: Command) -> Frame:
@@ -107,7 +117,10 @@ class Live:
         self, world: World, command: Command, push: str | None
     ) -> tuple[Frame, str]:
         added = self.pushes[push] if push else self._still
-        plan = self._plan(self._params, command.reward, self._key, world)
+        if self._decide is not None and command.is_for_policy:
+            plan = self._decide(command.reward, self._key, world)
+        else:
+            plan = self._plan(self._params, command.reward, self._key, world)
         world, earned, ended = self._step(
             command.reward, jnp.asarray(added), world, plan
         )
@@ -117,7 +130,7 @@ class Live:
             number=int(world.number),
             qpos=np.asarray(world.qpos),
             obs=np.asarray(world.env.obs),
-            ghosts=ghosts.reshape(-1, *ghosts.shape[2:]),
+            ghosts=ghosts.reshape(members * particles, *ghosts.shape[2:]),
             members=np.repeat(np.arange(members), particles),
             earned=float(earned),
             promised=float(plan.promised),
@@ -168,6 +181,20 @@ def _plan(
         )
 
     return plan
+
+
+def _decide(policy: Policy) -> Callable[..., Plan]:
+    """Returns what acts without a plan, and so imagines nothing."""
+
+    def decide(choice: RewardChoice, key: Array, world: World) -> Plan:
+        task = bound(choice, world.env.constants).task
+        known = jaxpets.PlanParams((), Guided(task, policy.networks))
+        key = jax.random.fold_in(key, world.number)
+        output, _ = policy.planner.step(known, key, (), world.env.obs)
+        unknown, nobody = jnp.float32(jnp.nan), jnp.zeros((0, 0, 2, *world.qpos.shape))
+        return Plan(world.planner, output.action, unknown, unknown, nobody)
+
+    return decide
 
 
 def _step(robot: Robot) -> Callable[..., tuple[World, Array, Array]]:

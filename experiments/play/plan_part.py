@@ -8,7 +8,7 @@ from viser import uplot
 from jaxpets import formulas
 
 from . import readout
-from .command import TO_EXPLORE, Commands
+from .command import PLAN, POLICY, TO_EXPLORE, Commands
 from .controls import Panel, Values, write
 from .readout import small
 from .scene import Look
@@ -21,7 +21,9 @@ _CURVE_SECONDS = 15.0
 class PlanPart:
     """Buttons, a line and sliders for what is wanted; curves of what came of it."""
 
-    def __init__(self, panel: Panel, commands: Commands, horizon: int) -> None:
+    def __init__(
+        self, panel: Panel, commands: Commands, horizon: int, *, has_policy: bool
+    ) -> None:
         self._gui, self._commands, self._horizon = panel.gui, commands, horizon
         hint = "The model was never trained for it."
         panel.add_buttons("reward", "task", list(commands.tasks), hint)
@@ -29,6 +31,9 @@ class PlanPart:
         panel.add_buttons("reward", "or", [TO_EXPLORE], hint)
         hint = "Type what you want more of."
         self._line = self._gui.add_text("reward", "", hint=hint)
+        if has_policy:
+            hint = "The policy knows the tasks alone; for all else there is a plan."
+            panel.add_buttons("acts", "acts by", [PLAN, POLICY], hint)
         self._under_line = self._gui.add_html("")
         with self._gui.add_folder("Words for it", expand_by_default=False):
             self._gui.add_html(_vocabulary(commands))

@@ -88,7 +88,9 @@ def under_line(command: Command) -> str:
             f"{html.escape(command.problem)}<br><code>{html.escape(where[:200])}</code>"
         )
         return small(text, "#c92a2a")
-    if command.name == TO_EXPLORE:
+    if command.is_for_policy:
+        text = f"It performs {html.escape(command.name)} by its policy, without a plan."
+    elif command.name == TO_EXPLORE:
         text = "It seeks what its networks disagree about."
     elif command.name and not command.line:
         text = f"It performs {html.escape(command.name)}, a reward of the robot's own."
@@ -101,6 +103,8 @@ def under_line(command: Command) -> str:
 
 def disagreement(frame: Frame) -> str:
     """Returns how much the members disagree, as HTML."""
+    if np.isnan(frame.disagreement):
+        return small("no plan, and so no disagreement about one")
     text = f"disagreement <b>{frame.disagreement:.2f}</b> of the model's own noise"
     return small(text)
 

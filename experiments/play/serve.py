@@ -32,6 +32,7 @@ class Options(NamedTuple):
     source: str
     env: str | None = None
     seed: int | None = None
+    policy: Path | None = None
     horizon: int | None = None
     watch: Path | None = None
     port: int | None = None
@@ -76,16 +77,17 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     robot, horizon = found.robot, options.horizon or found.search.horizon
     search = dataclasses.replace(found.search, horizon=horizon)
     rollout, _ = build.rollout_of(robot, found.size, search)
+    policy = source.policy_of(options.policy, robot) if options.policy else None
     live = Live(
         robot, rollout, build.optimizer(search, robot.env), found.params,
-        horizon=horizon, terminal_fn=build.imagined_end(robot.env),
+        horizon=horizon, terminal_fn=build.imagined_end(robot.env), policy=policy,
     )  # fmt: skip
     commands = command.Commands(robot, found.params)
     session = Session(live, commands.first)
     session.notice = "It compiles the planner: some seconds, once on this machine."
     page = Page(
         server, robot, options.env or robot.name, session, found.title, commands,
-        lambda panel: PlanPart(panel, commands, horizon),
+        lambda panel: PlanPart(panel, commands, horizon, has_policy=policy is not None),
     )  # fmt: skip
     return session, page
 

@@ -31,8 +31,8 @@ class Frame(NamedTuple):
       ghosts: `[G, H+1, Q]`, what was imagined in the step before, from where it began.
       members: `[G]`, whose imagination each of them is.
       earned: by the step; NaN where nothing says it.
-      promised: the return that was foreseen, per step.
-      disagreement: of the members about what was foreseen.
+      promised: the return that was foreseen, per step; NaN where nothing was planned.
+      disagreement: of the members about what was foreseen, likewise.
       wanted: in words, as `Command.label`.
       world: what its Stepper goes on from; None of what is only watched.
     """

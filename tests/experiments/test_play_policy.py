@@ -1,0 +1,118 @@
+"""The page's switch between plans and a policy that was distilled from them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import jaxpets
+from experiments import policy
+from experiments.errors import CheckpointError, UsageError
+from experiments.play.command import POLICY, TO_EXPLORE, Commands
+from experiments.play.readout import disagreement, under_line
+from jaxpets import envs
+from jaxpets.policies import ActorCriticConfig, Goals, actor_critic, save_policy
+
+pytest.importorskip("viser", reason="the extra jaxpets[play] is not installed")
+
+from experiments.play import source
+from experiments.play.controls import Controls, Press, Values
+from experiments.play.live import Live
+from experiments.play.session import Session
+
+
+def saved(robot, model, params, path, *, goals=None):
+    """Writes a policy that has learned nothing."""
+    env = robot.env
+    box = {"action_low": env.action_low, "action_high": env.action_high}
+    learner = actor_critic(
+        model.sample, robot.tasks.reward_fn, optax.adam(1e-3), ActorCriticConfig(),
+        robot.space, obs_size=18, num_members=model.num_members,
+        goals=goals or policy.family(robot, len(robot.tasks.names)), **box,
+    )  # fmt: skip
+    data = jaxpets.datasets.init(50, 18, 6)
+    noise = jax.random.normal(jax.random.key(1), (50, 18))
+    seen = jaxpets.Transition(noise, jnp.zeros((50, 6)), noise)
+    data = jaxpets.datasets.append(data, seen, 50)
+    tasks = robot.tasks.params
+    if goals is not None:
+        tasks = jax.tree.map(lambda x: x[0], tasks)
+    known = jaxpets.PlanParams(params, tasks)
+    state = jax.jit(learner.init)(known, jax.random.key(0), data)
+    save_policy(path, params=state.params, space=robot.space, obs_size=18, **box)
+    return path
+
+
+@pytest.fixture(scope="module")
+def cheetah():
+    return envs.make("pets/half_cheetah", backend="mujoco"), *jaxpets.pretrained("best")
+
+
+@pytest.fixture(scope="module")
+def found(cheetah, tmp_path_factory):
+    path = tmp_path_factory.mktemp("policy") / "policy-0.safetensors"
+    return source.policy_of(saved(*cheetah, path), cheetah[0])
+
+
+@pytest.fixture(scope="module")
+def live(cheetah, found):
+    robot, model, params = cheetah
+    box = {"action_low": robot.env.action_low, "action_high": robot.env.action_high}
+    sizes = {"horizon": 3, "num_samples": 6, "num_elites": 2, "num_iterations": 1}
+    search = jaxpets.optimizers.cem(**box, **sizes)
+    rollout = jaxpets.particle_rollout(model.sample, num_members=5, num_particles=5)
+    return Live(robot, rollout, search, params, horizon=3, policy=found)
+
+
+def test_a_policy_acts_on_tasks_and_plans_on_all_else(cheetah, live, found):
+    robot, _, params = cheetah
+    commands = Commands(robot, params)
+    first = Values(commands.first.line, (0.0,) * len(commands.sliders), 0.1, 0.0)
+    controls, session = Controls(commands, first), Session(live, commands.first)
+    frame = live.start(session.command)
+    assert len(frame.ghosts) and np.isfinite(frame.disagreement)
+
+    controls.apply(session, first, [Press("acts", POLICY)])
+    assert session.command.is_for_policy and "by its policy" in under_line(
+        session.command
+    )
+    acted, _ = live.step(frame, session.command, None)
+    # It is where the policy's own action leads.
+    task = jax.tree.map(lambda x: x[0], robot.tasks.params)
+    act = jax.jit(found.planner.step)
+    data = jaxpets.policies.Guided(task, found.networks)
+    obs = frame.world.env.obs
+    output, _ = act(jaxpets.PlanParams((), data), jax.random.key(0), (), obs)
+    there = robot.env.step(frame.world.env, output.action)
+    np.testing.assert_allclose(acted.obs, there.obs, atol=1e-6)
+    assert not len(acted.ghosts) and "no plan" in disagreement(acted)
+    assert np.isnan(acted.promised) and np.isfinite(acted.earned)
+
+    # What it cannot know is planned, and the switch stays.
+    for ask in (
+        lambda x: commands.by_name(x, TO_EXPLORE),
+        lambda x: commands.by_text(x, "velocity"),
+    ):
+        command = ask(session.command)
+        assert command.acts == POLICY and not command.is_for_policy
+        planned, _ = live.step(acted, command, None)
+        assert len(planned.ghosts)
+    controls.apply(session, first, [Press("acts", "x"), Press("acts", "plan")])
+    assert not session.command.is_for_policy
+
+
+def test_a_file_that_is_no_policy_of_the_robot_is_refused(cheetah, tmp_path):
+    robot = cheetah[0]
+    with pytest.raises(UsageError, match=r"--policy .* there is no such file"):
+        source.policy_of(tmp_path / "none.safetensors", robot)
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"x")
+    with pytest.raises(CheckpointError, match=r"bad\.safetensors"):
+        source.policy_of(bad, robot)
+    one = saved(*cheetah, tmp_path / "one.safetensors", goals=Goals())
+    with pytest.raises(CheckpointError, match="of another robot, or other tasks"):
+        source.policy_of(one, robot)
+    walker = envs.make("dmc/walker", backend="mujoco")
+    with pytest.raises(CheckpointError):
+        source.policy_of(one, walker)
