@@ -1,11 +1,11 @@
 """Phase 2 in a network: what the planner would do on any task, without a plan.
 
-The planner performs every task; what it sees is data to imagine from. Then, round by
-round, it is asked in imagined trials, where its search begins with what the policy
-would do; the policy learns what it said, and acts once per task, from where the next
-round imagines. At last the policy performs as the planner did, and so does the planner
-that begins with it. What was learned is saved before that, so that a run that was
-stopped goes on.
+The planner performs every task; what it sees is data to imagine from. With a critic the
+policy first learns from imagination alone. Then, round by round, it is asked in
+imagined trials, where its search begins with what the policy would do; the policy
+learns what it said, and acts once per task, from where the next round imagines. At last
+the policy performs as the planner did, and so does the planner that begins with it.
+What was learned is saved before that, so that a run that was stopped goes on.
 """
 
 import functools
@@ -206,7 +206,8 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
         now.progress.line(f"{text}  {time.monotonic() - begin:.1f} s")
     seconds = time.monotonic() - begin
     plans = settings.num_rounds * settings.horizon * settings.num_trials
-    now.folder.say(f"distilled {plans:,} plans of each seed  {seconds:.1f} s")
+    if plans:
+        now.folder.say(f"distilled {plans:,} plans of each seed  {seconds:.1f} s")
     return devices.collect(now.placement, learned.params, SEED)
 
 

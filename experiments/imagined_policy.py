@@ -74,14 +74,23 @@ def learned(
     keys, now = acting.split_keys(keys)
     state = init(params, now, dataset)
     count, updates = critic.calls(config)
+    skipped: Any = 0
     for _ in range(count):
         keys, now = acting.split_keys(keys)
         state, metrics = learn(params, now, state, dataset)
         jax.block_until_ready(state)
-    value, networks = devices.collect(placement, (metrics.value, state.params), SEED)
+        skipped += metrics.num_skipped
+    value, skipped, networks = devices.collect(
+        placement, (metrics.value, skipped, state.params), SEED
+    )
     earned = float(jnp.mean(value)) * (1 - config.critic.discount)
     run.say(
         f"imagined policy: {count * updates:,} gradient steps for all tasks; it "
         f"expects {earned:.3f} a step  {time.monotonic() - begin:.1f} s"
     )
+    if lost := int(jnp.sum(skipped)):
+        run.say(
+            f"warning: {lost:,} gradient steps of the imagined policy were not finite: "
+            "left out"
+        )
     return networks

@@ -90,7 +90,7 @@ class Live:
         )
         self._start = jax.jit(_start(robot, planner))
         self._plan = jax.jit(_plan(robot, rollout, planner, horizon))
-        self._decide = jax.jit(_decide(policy)) if policy else None
+        self._decide = jax.jit(_decide(policy, planner)) if policy else None
         self._step = jax.jit(_step(robot))
 
     def start(self, command: Command) -> Frame:
@@ -99,6 +99,8 @@ class Live:
         self._starts += 1
         world = self._start(command.reward, key)
         # Compiled now, while somebody is told so.
+        if self._decide is not None:
+            jax.block_until_ready(self._decide(command.reward, self._key, world))
         frame, _ = self._stepped(world, command, None)
         return frame._replace(
             number=0,
@@ -183,8 +185,8 @@ def _plan(
     return plan
 
 
-def _decide(policy: Policy) -> Callable[..., Plan]:
-    """Returns what acts without a plan, and so imagines nothing."""
+def _decide(policy: Policy, planner: jaxpets.Planner) -> Callable[..., Plan]:
+    """Returns what acts and imagines nothing; later plans begin anew."""
 
     def decide(choice: RewardChoice, key: Array, world: World) -> Plan:
         task = bound(choice, world.env.constants).task
@@ -192,7 +194,7 @@ def _decide(policy: Policy) -> Callable[..., Plan]:
         key = jax.random.fold_in(key, world.number)
         output, _ = policy.planner.step(known, key, (), world.env.obs)
         unknown, nobody = jnp.float32(jnp.nan), jnp.zeros((0, 0, 2, *world.qpos.shape))
-        return Plan(world.planner, output.action, unknown, unknown, nobody)
+        return Plan(planner.init(), output.action, unknown, unknown, nobody)
 
     return decide
 

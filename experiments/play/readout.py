@@ -47,7 +47,9 @@ def curves(frames: Sequence[Frame], horizon: int, step_time: float) -> Curves:
 
 
 def _follows(before: Frame, after: Frame) -> bool:
-    return after.number == before.number + 1 and after.wanted == before.wanted
+    is_planned = np.isnan(before.promised) == np.isnan(after.promised)
+    is_next = after.number == before.number + 1
+    return bool(is_next and after.wanted == before.wanted and is_planned)
 
 
 def status(

@@ -95,6 +95,8 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
 def _watching(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     """Returns the page of a run that explores."""
     assert options.watch is not None
+    if options.policy is not None:
+        raise UsageError("--policy is of a robot that plans; --watch shows a run.")
     run = Watched(options.watch, env=options.env, seed=options.seed)
     replay = Replay(run)
     session = Session(replay, command.NOTHING)

@@ -21,13 +21,13 @@ from jaxpets.envs import Robot, env_rollout, with_constants
 
 from .. import acting, robots
 from ..build import imagined_end, optimizer
-from ..config import Config, EngineName, PlannerConfig
+from ..config import EngineName, PlannerConfig
 from ..errors import RunError
-from ..presets import quick_search
+from ..presets import PRESETS, quick_search
 from ..storage import metrics, rundir
 from ..storage.environment import environment
 
-_SEARCH = quick_search(Config())
+_SEARCH = quick_search(PRESETS["paper"])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -126,7 +126,7 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
     front = (root / "README.md").read_text().splitlines()
     arms = ("best", "epistemic", "info-gain", "random")
     for words, tag in (
-        ("the paper's CEM, no refit", "cem"),
+        ("CEM, no refit", "cem"),
         ("iCEM, after a refit", "refit-icem"),
     ):
         row = [cells.get((tag, arm), "not run") for arm in arms]

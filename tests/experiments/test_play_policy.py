@@ -10,7 +10,7 @@ import jaxpets
 from experiments import policy
 from experiments.errors import CheckpointError, UsageError
 from experiments.play.command import POLICY, TO_EXPLORE, Commands
-from experiments.play.readout import disagreement, under_line
+from experiments.play.readout import curves, disagreement, under_line
 from jaxpets import envs
 from jaxpets.policies import ActorCriticConfig, Goals, actor_critic, save_policy
 
@@ -88,6 +88,8 @@ def test_a_policy_acts_on_tasks_and_plans_on_all_else(cheetah, live, found):
     np.testing.assert_allclose(acted.obs, there.obs, atol=1e-6)
     assert not len(acted.ghosts) and "no plan" in disagreement(acted)
     assert np.isnan(acted.promised) and np.isfinite(acted.earned)
+    # A promise of the planner is not compared with what the policy earned.
+    assert np.isnan(curves([frame, acted], 1, 0.05).promised).all()
 
     # What it cannot know is planned, and the switch stays.
     for ask in (

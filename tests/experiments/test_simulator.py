@@ -14,6 +14,10 @@ TINY = (
 )  # fmt: skip
 
 
+def test_it_searches_as_the_shipped_models_do():
+    assert simulator.Arguments().task_planner.optimizer == "icem"
+
+
 @pytest.mark.slow
 def test_every_task_is_performed_and_logged(tmp_path, capsys):
     """Even a search this small knows what comes next: no task goes backwards."""
