@@ -75,10 +75,10 @@ def memory_advice(config: Config) -> str:
     seeds, trials = len(config.seeds), _num_tasks(config)
     flags = [f"--{group}.num-samples", f"--{group}.num-particles"]
     learned = ""
+    if critics := _num_critics(config):
+        learned = f"{critics} critics learn at once, and "
+        flags = ["--critic.batch-size", *flags[: 2 * (not config.critic.acts)]]
     if config.phase == "zero-shot":
-        if config.critic.num_updates:
-            learned = f"{seeds} seeds x {trials} critics learn at once, and "
-            flags = ["--critic.batch-size", *flags[: 2 * (not config.critic.acts)]]
         trials *= config.eval_trials
         flags.insert(0, "--eval-trials")
     if config.phase == "distill":
@@ -100,13 +100,18 @@ def _search(config: Config) -> tuple[str, PlannerConfig]:
 
 
 def _critic_steps(config: Config) -> int:
-    """Returns about as many imagined steps as critics of zero-shot cost."""
-    if config.phase != "zero-shot":
-        return 0
+    """Returns about as many imagined steps as critics cost."""
     critic = config.critic
     rows = critic.num_updates * critic.batch_size * critic.horizon
-    networks = len(config.seeds) * _num_tasks(config)
-    return 3 * rows * networks  # the networks themselves cost about twice the model
+    return 3 * rows * _num_critics(config)  # the networks cost about twice the model
+
+
+def _num_critics(config: Config) -> int:
+    """Returns how many critics learn at once; of distill one has all tasks."""
+    if not config.critic.num_updates or config.phase not in ("zero-shot", "distill"):
+        return 0
+    tasks = _num_tasks(config) if config.phase == "zero-shot" else 1
+    return len(config.seeds) * tasks
 
 
 def _num_tasks(config: Config) -> int:

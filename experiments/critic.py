@@ -1,25 +1,53 @@
-"""The actor and the critic of a task, as a config has them."""
+"""The actor and the critic of a task, as a config has them, and how they learn."""
 
 import dataclasses
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import PartitionSpec as P
 
 import jaxpets
 from jaxpets.envs import Robot, with_constants
-from jaxpets.policies import ActorCritic, ActorCriticConfig, Goals, actor_critic
+from jaxpets.policies import (
+    ActorCritic,
+    ActorCriticConfig,
+    ActorCriticParams,
+    Goals,
+    actor_critic,
+)
 
+from . import acting
 from .acting import at_start
 from .config import Config, part
+from .parallel import devices
+from .parallel.devices import Placement
+from .storage.folder import RunFolder
 
 TerminalFn = Callable[[Any, Array], Array] | None
 
 # Gradient steps of one call of the compiled program; a signal waits for it.
 _STEPS = 1000
+
+
+class Several(NamedTuple):
+    """Critics that learn side by side, and what each of them has for itself.
+
+    Attributes:
+      name: of one of them, as it is said.
+      axes: of all, as `devices.AXES` calls them.
+      known: which of these PlanParams have, as PartitionSpecs.
+      data: which the data have.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    known: Any
+    data: Any
 
 
 def make_critic(
@@ -49,6 +77,66 @@ def make_critic(
         goals=goals_of(robot) if goals is None else goals,
         terminal_fn=terminal_fn,
     )
+
+
+def over(several: Several, function: Any, takes: tuple[Any, ...]) -> Any:
+    """Maps what one critic takes over all of them."""
+    for axis in reversed(several.axes):
+        function = acting.over(function, takes, axis)
+    return function
+
+
+def learned(
+    config: Config, critic: ActorCritic, several: Several, placement: Placement,
+    params: jaxpets.PlanParams, keys: Array, dataset: jaxpets.typing.Dataset,
+    run: RunFolder,
+) -> ActorCriticParams:  # fmt: skip
+    """Returns the networks of critics that have learned, and tells the run.
+
+    Args:
+      config: with the numbers of a critic.
+      critic: as `make_critic` returns it.
+      several: of how many.
+      placement: of them; params, keys and data are placed.
+      params: models, and the params of tasks.
+      keys: of all axes.
+      dataset: where imagined trials begin.
+      run: that is told.
+    """
+    every = P(*several.axes)
+
+    def program(function: Any, takes: Any, gives: Any, **options: Any) -> Any:
+        split = devices.split(placement, over(several, function, takes), takes, gives)
+        return jax.jit(split, **options)
+
+    takes = (several.known, every, several.data)
+    init = program(critic.init, takes, every)
+    takes = (several.known, every, every, several.data)
+    learn = program(critic.step, takes, (every, every), donate_argnums=2)
+    begin = time.monotonic()
+    keys, now = acting.split_keys(keys)
+    state = init(params, now, dataset)
+    count, updates = calls(config)
+    skipped: Any = 0
+    for _ in range(count):
+        keys, now = acting.split_keys(keys)
+        state, metrics = learn(params, now, state, dataset)
+        jax.block_until_ready(state)
+        skipped += metrics.num_skipped
+    value, skipped, networks = devices.collect(
+        placement, (metrics.value, skipped, state.params), *several.axes
+    )
+    earned = float(jnp.mean(value)) * (1 - config.critic.discount)
+    run.say(
+        f"{several.name}: {count * updates:,} gradient steps; its actor expects "
+        f"{earned:.3f} a step  {time.monotonic() - begin:.1f} s"
+    )
+    if lost := int(jnp.sum(skipped)):
+        run.say(
+            f"warning: {lost:,} gradient steps of {several.name} were not finite: "
+            "left out"
+        )
+    return networks
 
 
 def calls(config: Config) -> tuple[int, int]:

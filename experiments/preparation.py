@@ -4,11 +4,7 @@ The reward of a task is first read here. What is learned is saved with the model
 performs, so that a run that was stopped goes on.
 """
 
-import time
-from typing import Any
-
 import jax
-import jax.numpy as jnp
 from jax import Array
 from jax.sharding import PartitionSpec as P
 
@@ -16,7 +12,7 @@ import jaxpets
 from jaxpets.envs import Tasks
 from jaxpets.policies import ActorCriticParams
 
-from . import acting, critic, exploration, robots
+from . import critic, exploration, robots
 from .build import CRITIC, Parts, State, key_per, trial_keys
 from .config import Config
 from .model_file import Source
@@ -25,11 +21,13 @@ from .parallel.devices import SEED, TASK
 from .refit import refitted
 from .storage.folder import RunFolder
 
-# Which axes seeds and tasks have: of PlanParams, of data, and of all else.
-_KNOWN = jaxpets.PlanParams(P(SEED), P(TASK))
-# The size of the data is one number, for all seeds.
-_DATA = jaxpets.datasets.AXES._replace(data=P(SEED), size=P(), cursor=P())
-_EVERY = P(SEED, TASK)
+_CRITICS = critic.Several(
+    "a critic of each task",
+    (SEED, TASK),
+    jaxpets.PlanParams(P(SEED), P(TASK)),
+    # The size of the data is one number, for all seeds.
+    jaxpets.datasets.AXES._replace(data=P(SEED), size=P(), cursor=P()),
+)
 
 
 def prepared(
@@ -72,8 +70,9 @@ def template(config: Config, parts: Parts, tasks: Tasks) -> State:
     model = exploration.model_of(explored)
     if parts.critic is None:
         return model
+    takes = (_CRITICS.known, P(SEED, TASK), _CRITICS.data)
     begun = jax.eval_shape(
-        _mapped(parts.critic.init, (_KNOWN, _EVERY, _DATA)),
+        critic.over(_CRITICS, parts.critic.init, takes),
         jaxpets.PlanParams(explored.params, tasks.params),
         _keys(config, parts, tasks, 0),
         explored.dataset,
@@ -87,57 +86,15 @@ def _learned(
     """Returns the networks `[S, K]` of every seed and task."""
     assert parts.critic is not None
     placement = devices.spread(len(config.seeds), len(tasks.names))
-
-    def program(
-        function: Any, takes: tuple[Any, ...], gives: Any, **options: Any
-    ) -> Any:
-        split = devices.split(placement, _mapped(function, takes), takes, gives)
-        return jax.jit(split, **options)
-
-    init = program(parts.critic.init, (_KNOWN, _EVERY, _DATA), _EVERY)
-    learn = program(
-        parts.critic.step,
-        (_KNOWN, _EVERY, _EVERY, _DATA),
-        (_EVERY, _EVERY),
-        donate_argnums=2,
-    )
-    begin = time.monotonic()
     keys = devices.place(placement, _keys(config, parts, tasks, step), SEED, TASK)
     params = jaxpets.PlanParams(
         devices.place(placement, state.params, SEED),
         devices.place(placement, tasks.params, TASK),
     )
     dataset = devices.place(placement, state.dataset, SEED)
-    keys, now = acting.split_keys(keys)
-    learned = init(params, now, dataset)
-    count, updates = critic.calls(config)
-    skipped: Any = 0
-    for _ in range(count):
-        keys, now = acting.split_keys(keys)
-        learned, metrics = learn(params, now, learned, dataset)
-        jax.block_until_ready(learned)
-        skipped += metrics.num_skipped
-    value, skipped, networks = devices.collect(
-        placement, (metrics.value, skipped, learned.params), SEED, TASK
+    return critic.learned(
+        config, parts.critic, _CRITICS, placement, params, keys, dataset, run
     )
-    earned = jnp.mean(value) * (1 - config.critic.discount)
-    seconds = time.monotonic() - begin
-    run.say(
-        f"critic: {count * updates:,} gradient steps for each task; the actors expect "
-        f"{earned:.3f} a step  {seconds:.1f} s"
-    )
-    if lost := int(jnp.sum(skipped)):
-        run.say(
-            f"warning: {lost:,} gradient steps of critics were not finite: left out"
-        )
-    return networks
-
-
-def _mapped(function: Any, takes: tuple[Any, ...]) -> Any:
-    """Maps what one seed's task takes over tasks, then over seeds."""
-    for axis in (TASK, SEED):
-        function = acting.over(function, takes, axis)
-    return function
 
 
 def _keys(config: Config, parts: Parts, tasks: Tasks, step: int) -> Array:

@@ -256,6 +256,12 @@ def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
     assert "--phase zero-shot of --preset smoke would take about 3 hours" in line
     code, line = fail("distill", *LATER[2:], "--distill.horizon", "100000", *huge[:2])
     assert code == 2 and "--phase distill of --preset smoke would take" in line
+    for phase in ("zero-shot", "distill"):
+        code, line = fail(phase, *LATER[2:], "--critic.num-updates", "1000000000")
+        assert code == 2 and f"--phase {phase} of --preset smoke would take" in line
+
+
+_CRITIC = dataclasses.replace(PRESETS["smoke"].critic, num_updates=1)
 
 
 @pytest.mark.parametrize(
@@ -272,6 +278,11 @@ def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
             dict(phase="distill", task="forward"),
             "6 trials",
             "--seeds, --eval-trials, --distill.num-trials, --task-planner.num-samples",
+        ),
+        (
+            dict(phase="distill", task="forward", critic=_CRITIC),
+            "6 trials",
+            "--seeds, --eval-trials, --distill.num-trials, --critic.batch-size",
         ),
     ],
 )

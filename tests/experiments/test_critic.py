@@ -19,7 +19,7 @@ FLAGS = (
     "--critic.num-updates", "3", "--critic.batch-size", "6", "--critic.horizon", "2",
     "--critic.hidden-size", "8",
 )  # fmt: skip
-SAID = "critic: 3 gradient steps for each task"
+SAID = "a critic of each task: 3 gradient steps"
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ def test_a_policy_can_be_imagined_before_a_planner_is_asked(explored, capsys):
     flags = ("--critic.num-updates", "5", "--critic.batch-size", "6")
     alone = ("--distill.num-rounds", "0", "--tag", "imagined")
     said = distilled(explored, capsys, *flags, *alone)
-    assert "imagined policy: 5 gradient steps" in said
+    assert "an imagined policy of all tasks: 5 gradient steps" in said
     assert "plans of each seed" not in said and "distill 1/" not in said
     rows = runs.rows(explored / f"{FOLDER}-imagined")
     assert [row["planner"] for row in rows[::4]] == ["plan", "policy", "both"]
