@@ -9,7 +9,7 @@ was upright, and of the reward that was planned, what came.
 import argparse
 import itertools
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,6 +24,8 @@ from ..storage.metrics import Row, number
 from . import suite
 
 UPRIGHT = "upright"  # a task that measures
+_GROUPS = ("the paper's tasks", "other tasks")
+_AS_SET = "as the runs are set"
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]  # variant, arm, task
 Ceilings = dict[str, float]  # of a step, by task
 
@@ -47,6 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("runs", type=Path, help="a folder with runs below it")
     parser.add_argument("--ceilings", type=Path, required=True, help="the simulator's")
     parser.add_argument("--explored", type=int, default=60, help="exploration trials")
+    parser.add_argument(
+        "--than", default="best", metavar="ARM", help="the others are compared with it"
+    )
     parser.add_argument("--json", type=Path, help="file for the results")
     args = parser.parse_args(argv)
     try:
@@ -58,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
-    print("\n".join(report(found)))
+    print("\n".join(report(found, args.than)))
     return 0
 
 
@@ -111,26 +116,61 @@ def results(rows: Iterable[Row], ceiling: Ceilings) -> Results:
     return found
 
 
-def report(found: Results) -> list[str]:
-    """Returns the tables: all tasks in one score, what each part brings, each task."""
+def report(found: Results, than: str) -> list[str]:
+    """Returns the tables: scores by arm and variant, differences, and every task.
+
+    Args:
+      found: as `results` has it.
+      than: the arm that the others are compared with.
+    """
+    arms = tables.in_order({arm for by_arm in found.values() for arm in by_arm})
     lines: list[str] = []
+    for group in _GROUPS:
+        scores = {
+            tag: {arm: _by_seed(x, group) for arm, x in by_arm.items()}
+            for tag, by_arm in found.items()
+        }
+        lines += [f"## {group}", "", *_by_variant(scores, arms, _iqm)]
+        lines += [f"## {group}, less `{than}`, %", ""]
+        others = [arm for arm in arms if arm != than]
+        lines += _by_variant(_less(scores, than), others, _interval)
+    lines += ["## share of upright steps, and of what was planned what came", ""]
+    lines += _by_variant(found, arms, _shares)
+    lines += ["## one variant less another, %", "", *_effects(found, arms)]
     for tag, by_arm in found.items():
-        arms = tables.in_order(by_arm)
-        lines += [f"## {tag or 'as the runs are set'}", ""]
-        lines += tables.table(
-            ["arm", "the paper's tasks", "tasks held out", "upright", "came / planned"],
-            [[f"`{arm}`", *_summary(by_arm[arm])] for arm in arms],
-        )
-        every = dict.fromkeys(task for x in by_arm.values() for task in x)
-        names = tables.tasks_in_order(every)
-        lines += tables.table(
-            ["task, return", *(f"`{arm}`" for arm in arms)],
-            [
-                [task, *(suite.cell(by_arm[arm].get(task)) for arm in arms)]
-                for task in names
-            ],
-        )
-    return [*lines, "## one variant less another", "", *_effects(found)]
+        lines += [f"## every task, {tag or _AS_SET}", "", *_every(by_arm)]
+    return lines
+
+
+def _by_variant(
+    found: Mapping[str, Mapping[str, Any]], arms: Iterable[str],
+    cell: Callable[[Any], str],
+) -> list[str]:  # fmt: skip
+    """Returns a table of arms by variants."""
+    rows = [
+        [f"`{arm}`", *(cell(x[arm]) if arm in x else "-" for x in found.values())]
+        for arm in arms
+    ]
+    return tables.table(["arm", *(tag or _AS_SET for tag in found)], rows)
+
+
+def _less(
+    scores: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]], than: str
+) -> dict[str, dict[str, stats.Difference]]:
+    """Returns how far arms are from one of them, in means over tasks of seeds."""
+    apart: dict[str, dict[str, stats.Difference]] = {}
+    for tag, by_arm in scores.items():
+        means = {
+            arm: 100.0 * np.mean(list(by_seed.values()), axis=1)
+            for arm, by_seed in by_arm.items()
+            if by_seed
+        }
+        apart[tag] = {
+            arm: stats.difference(mean, means[than])
+            for arm, mean in means.items()
+            if arm != than and than in means
+        }
+    return apart
 
 
 def _beside(rows: Sequence[Row], length: int) -> dict[str, Any]:
@@ -147,13 +187,10 @@ def _beside(rows: Sequence[Row], length: int) -> dict[str, Any]:
     return measures
 
 
-def _summary(by_task: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Returns the cells of an arm; `upright` is no task here."""
-    tasks = {name: x for name, x in by_task.items() if name != UPRIGHT}
-    papers = [x for name, x in tasks.items() if name in tables.TASKS]
-    others = [x for name, x in tasks.items() if name not in tables.TASKS]
-    shares = [_mean(x.get(measure) for x in tasks.values()) for measure in _BESIDE]
-    return [_iqm(papers), _iqm(others), *shares]
+def _shares(by_task: Mapping[str, Mapping[str, Any]]) -> str:
+    """Returns means over tasks of what is beside a score; `upright` is no task here."""
+    tasks = [x for name, x in by_task.items() if name != UPRIGHT]
+    return ", ".join(_mean(x.get(measure) for x in tasks) for measure in _BESIDE)
 
 
 _BESIDE = (UPRIGHT, "kept")
@@ -164,54 +201,80 @@ def _mean(values: Iterable[float | None]) -> str:
     return f"{np.mean(known):.2f}" if known else "-"
 
 
-def _iqm(of_tasks: Sequence[Mapping[str, Any]]) -> str:
-    """Returns the interquartile mean of scores, over seeds that performed all tasks."""
-    scores = np.array(list(_by_seed(of_tasks).values())).T if of_tasks else np.empty(0)
-    if not scores.size:
+def _by_seed(
+    by_task: Mapping[str, Mapping[str, Any]], group: str | None = None
+) -> dict[str, list[float]]:
+    """Returns the scores of a group's tasks by seed, of seeds that performed all."""
+    chosen = [
+        x
+        for name, x in by_task.items()
+        if name != UPRIGHT and group in (None, _group(name))
+    ]
+    seeds = set.intersection(*(set(x["score"]) for x in chosen)) if chosen else set()
+    every = {seed: [x["score"][seed] for x in chosen] for seed in sorted(seeds)}
+    return {seed: scores for seed, scores in every.items() if np.isfinite(scores).all()}
+
+
+def _group(task: str) -> str:
+    return _GROUPS[task not in tables.TASKS]
+
+
+def _iqm(by_seed: Mapping[str, Sequence[float]]) -> str:
+    """Returns the interquartile mean of scores over tasks and seeds."""
+    if not by_seed:
         return "-"
+    scores = np.array(list(by_seed.values())).T
     low, high = stats.stratified_interval(scores)
     return f"{float(stats.iqm(scores.reshape(-1))):.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _by_seed(of_tasks: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
-    """Returns the scores of all tasks by seed, of seeds of which all are finite."""
-    seeds = set.intersection(*(set(x["score"]) for x in of_tasks))
-    every = {seed: [x["score"][seed] for x in of_tasks] for seed in sorted(seeds)}
-    return {seed: scores for seed, scores in every.items() if np.isfinite(scores).all()}
-
-
-def _effects(found: Results) -> list[str]:
+def _effects(found: Results, arms: Sequence[str]) -> list[str]:
     """Returns differences of a seed's mean score over tasks between two variants.
 
     The two have their model in common, so a seed's difference is one number.
     """
-    arms = tables.in_order({arm for by_arm in found.values() for arm in by_arm})
-    lines = []
-    for arm in arms:
-        for other, one in itertools.combinations(found, 2):
-            if _one_apart(one, other) and arm in found[one] and arm in found[other]:
-                ours, theirs = (_tasks_of(found[tag][arm]) for tag in (one, other))
-                gaps = 100.0 * np.array(
-                    [
-                        np.mean(ours[seed]) - np.mean(theirs[seed])
-                        for seed in ours
-                        if seed in theirs
-                    ]
-                )
-                lines.append([f"`{arm}`", one, other, _difference(gaps)])
-    return tables.table(["arm", "variant", "less", "score, %"], lines)
+    pairs = [
+        (one, other)
+        for other, one in itertools.combinations(found, 2)
+        if _one_apart(one, other)
+    ]
+
+    def cell(arm: str, one: str, other: str) -> str:
+        if not (arm in found[one] and arm in found[other]):
+            return "-"
+        ours, theirs = (_by_seed(found[tag][arm]) for tag in (one, other))
+        both = [seed for seed in ours if seed in theirs]
+        if not both:
+            return "-"
+        gaps = np.array([np.mean(ours[x]) - np.mean(theirs[x]) for x in both])
+        gaps *= 100.0
+        return _interval(stats.Difference(float(gaps.mean()), stats.t_interval(gaps)))
+
+    return tables.table(
+        ["variant", "less", *(f"`{arm}`" for arm in arms)],
+        [
+            [one, other, *(cell(arm, one, other) for arm in arms)]
+            for one, other in pairs
+        ],
+    )
 
 
-def _tasks_of(by_task: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float]]:
-    return _by_seed([x for name, x in by_task.items() if name != UPRIGHT])
+def _interval(found: stats.Difference) -> str:
+    beside = " [{:.1f}, {:.1f}]".format(*found.ci95) if found.ci95 else ""
+    return f"{found.mean:.1f}{beside}"
 
 
-def _difference(gaps: np.ndarray) -> str:
-    if not len(gaps):
-        return "-"
-    interval = stats.t_interval(gaps)
-    beside = f" [{interval[0]:.0f}, {interval[1]:.0f}]" if interval else ""
-    return f"{gaps.mean():.0f}{beside}"
+def _every(by_arm: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> list[str]:
+    """Returns the returns of every task, and their intervals."""
+    arms = tables.in_order(by_arm)
+    tasks = dict.fromkeys(task for x in by_arm.values() for task in x)
+    return tables.table(
+        ["task, return", *(f"`{arm}`" for arm in arms)],
+        [
+            [task, *(suite.cell(by_arm[arm].get(task)) for arm in arms)]
+            for task in tables.tasks_in_order(tasks)
+        ],
+    )
 
 
 def _one_apart(one: str, other: str) -> bool:

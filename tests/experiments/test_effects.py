@@ -63,16 +63,48 @@ def test_a_score_is_a_share_of_what_the_simulator_reaches(runs, ceilings, tmp_pa
     assert found["icem"]["random"]["jump"]["kept"] is None  # it planned nothing
 
 
-def test_tables_compare_what_is_one_apart(runs, ceilings, capsys):
+def test_scores_are_shown_by_arm_and_variant(runs, ceilings, capsys):
     assert effects.main([str(runs), "--ceilings", str(ceilings)]) == 0
-    text = capsys.readouterr().out
-    assert "| `best` | 0.50 [0.40, 0.60] | 0.50 [0.50, 0.50] | 0.50 | 0.50 |" in text
-    pairs = text.partition("one variant less another")[2]
+    shown = sections(capsys.readouterr().out)
+    papers, others = shown["the paper's tasks"], shown["other tasks"]
+    assert papers[0] == "| arm | cem | icem | refit-icem |"
+    # IQM of what two seeds have of 5 and 2 a step.
+    best = "0.30 [0.20, 0.40] | 0.50 [0.40, 0.60] | 0.80 [0.80, 0.80]"
+    assert f"| `best` | {best} |" in papers
+    assert "| `random` | - | 0.20 [0.10, 0.30] | - |" in papers
+    best = "0.25 [0.25, 0.25] | 0.50 [0.50, 0.50] | 1.00 [0.75, 1.25]"
+    assert f"| `best` | {best} |" in others
+    beside = shown["share of upright steps, and of what was planned what came"]
+    assert "| `random` | - | 1.00, 0.50 | - |" in beside
+
+
+def test_arms_are_compared_with_one_of_them(runs, ceilings, capsys):
+    def shown(*flags):
+        flags = ["--ceilings", str(ceilings), *flags]
+        assert effects.main([str(runs), *flags]) == 0
+        return sections(capsys.readouterr().out)
+
+    # 10 and 30 % less 40 and 60 %: Welch's interval of four numbers.
+    less = shown()["the paper's tasks, less `best`, %"]
+    assert "| `random` | - | -30.0 [-90.8, 30.8] | - |" in less
+    assert not any("`best`" in line for line in less)
+    less = shown("--than", "random")["the paper's tasks, less `random`, %"]
+    assert "| `best` | - | 30.0 [-30.8, 90.8] | - |" in less
+
+
+def test_variants_are_compared_where_one_thing_differs(runs, ceilings, capsys):
+    assert effects.main([str(runs), "--ceilings", str(ceilings)]) == 0
+    pairs = sections(capsys.readouterr().out)["one variant less another, %"]
+    assert pairs[0] == "| variant | less | `random` | `best` |"
     # By seed 0.45 and 0.55 less 0.225 and 0.325: the same for both, and so no chance.
-    assert "| `best` | icem | cem | 22 [22, 2" in pairs  # 22.5, as it rounds
-    assert "| `best` | refit-icem | icem |" in pairs
-    assert "| `best` | refit-icem | cem |" not in pairs
-    assert "`random`" not in pairs
+    assert "| icem | cem | - | 22.5 [22.5, 22.5] |" in pairs
+    assert [x.split(" | ")[:2] for x in pairs[3:]] == [["| refit-icem", "icem"]]
+
+
+def sections(text):
+    """The lines of every table, by its heading."""
+    found = (part.splitlines() for part in text.split("## ")[1:])
+    return {title: [x for x in lines if x] for title, *lines in found}
 
 
 def test_what_cannot_be_read_is_said(runs, ceilings, tmp_path, capsys):
@@ -113,24 +145,46 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
     assert json.loads(found.read_text()) == json.loads(
         (root / "results" / "study.json").read_text()
     )
-    page = (root / "results" / "study.md").read_text().splitlines()
-    cells = {}
-    for variant in capsys.readouterr().out.split("## ")[1:]:
-        tag, *lines = variant.splitlines()
-        for line in lines:
-            if tag == "refit-icem" or line.startswith("| `"):
-                assert line in page
-            if line.startswith("| `") and not tag.startswith("one"):
-                arm, _, held_out, *_ = line.strip("| ").split(" | ")
-                cells[tag, arm.strip("`")] = held_out
-    front = (root / "README.md").read_text().splitlines()
-    arms = ("best", "epistemic", "info-gain", "random")
-    for words, tag in (
+    page = (root / "results" / "study.md").read_text()
+    shown = sections(capsys.readouterr().out)
+    place = 0
+    for title, lines in shown.items():  # in the order in which they are printed
+        if title not in _IN_THE_JSON and not title.startswith("every task"):
+            place = page.index("\n".join(lines), place) + 1
+    assert "\n".join(shown["every task, refit-icem"]) in page
+    rows = [line.strip("| ").split(" | ") for line in shown["other tasks"]]
+    variants = rows[0]
+    held_out = {row[0]: row for row in rows}
+    front = (root / "README.md").read_text()
+    for words, variant in (
         ("CEM, no refit", "cem"),
         ("iCEM, after a refit", "refit-icem"),
     ):
-        row = [cells.get((tag, arm), "not run") for arm in arms]
-        assert f"| {words} | {' | '.join(row)} |" in front
+        at = variants.index(variant)
+        cells = [held_out[f"`{arm}`"][at] for arm in _ON_THE_FRONT]
+        assert f"| {words} | {' | '.join(cells)} |" in front
+
+
+_IN_THE_JSON = ("the paper's tasks, less `best`, %",)
+_ON_THE_FRONT = ("best", "epistemic", "info-gain", "random")
+
+
+def test_the_page_has_what_models_know_of_all_data():
+    root = Path(__file__).parents[2] / "results"
+    page = (root / "study.md").read_text()
+    found = {
+        name: json.loads((root / "study" / f"{name}.json").read_text())
+        for name in ("open_loop", "model_error")
+    }
+    assert found["open_loop"]["trials"] == found["model_error"]["trials"]
+    for arm, by_step in found["open_loop"]["arms"].items():
+        cells = [f"`{arm}`"]
+        cells += [f"{by_step[step]['error']['mean']:.3f}" for step in ("1", "10", "30")]
+        cells += [
+            f"{by_step[step]['coverage']['mean']:.2f}" for step in ("1", "10", "30")
+        ]
+        nll = [x["mean"] for x in found["model_error"]["nll"][arm].values()]
+        assert f"| {' | '.join(cells)} | {np.mean(nll):.2f} |" in page
 
 
 def test_the_interval_of_an_iqm_draws_seeds_within_tasks():
