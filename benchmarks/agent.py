@@ -9,6 +9,7 @@ onnxruntime on one thread, and by JAX, one after the other.
 """
 
 import argparse
+import dataclasses
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -31,12 +32,22 @@ Call = Callable[[], np.ndarray]
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row."""
     size = workloads.chosen_size(args)
-    planner = workloads.planner(size, "f32", args.optimizer, engine=args.engine)
+    planner = workloads.planner(
+        size, args.precision, args.optimizer, engine=args.engine
+    )
     pairs = timing.in_turn(*calls(size, planner), repeats=args.repeats)
     acts, plans = 1e3 * np.asarray(pairs).T
     yield rows.make_row(
         "agent",
-        {"size": args.size, "engine": args.engine, "optimizer": args.optimizer},
+        {
+            **dataclasses.asdict(size),
+            "size": args.size,
+            "precision": args.precision,
+            "engine": args.engine,
+            "optimizer": args.optimizer,
+        },
+        arch=workloads.arch(size, args.precision, args.engine),
+        awaited=True,
         added_ms=float(np.median(acts - plans)),
         act_ms=float(np.median(acts)),
         act_p99_ms=float(np.percentile(acts, 99)),
@@ -126,6 +137,9 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     )
     parser.add_argument(
         "--engine", choices=workloads.ENGINES, default="kernel", help="what imagines"
+    )
+    parser.add_argument(
+        "--precision", choices=workloads.PRECISIONS, default="f32", help="of the model"
     )
     parser.set_defaults(size="laptop", repeats=1000)
     parser.add_argument("--policy", action="store_true", help="a policy, not a plan")

@@ -16,6 +16,7 @@ import optax
 from jax import Array
 
 import jaxpets
+from benchmarks import rows
 from experiments.cost import model_flops
 from jaxpets.envs import half_cheetah
 
@@ -38,6 +39,7 @@ ENGINES = ("scan", "kernel", "sm_90")
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
+_OTHERS = ("num_particles", "num_iterations")
 
 
 def named_size(name: str) -> Size:
@@ -70,15 +72,20 @@ def with_network(size: Size, network: Any) -> Size:
 
 
 def add_size_flag(parser: argparse.ArgumentParser) -> None:
-    """Adds `--size`."""
+    """Adds `--size`, and what may differ from it."""
     parser.add_argument(
         "--size", choices=("paper", "laptop"), default="paper", help="of the planner"
     )
+    for name in _OTHERS:
+        flag = f"--{name.replace('_', '-')}"
+        parser.add_argument(flag, type=rows.positive, help="in place of the size's")
 
 
 def chosen_size(args: argparse.Namespace) -> Size:
-    """Returns the size that `--size` and `--tiny` ask for."""
-    return named_size("tiny" if args.tiny else args.size)
+    """Returns the size that the flags ask for."""
+    size = named_size("tiny" if args.tiny else args.size)
+    others = {name: getattr(args, name, None) for name in _OTHERS}
+    return dataclasses.replace(size, **{x: n for x, n in others.items() if n})
 
 
 def ensemble_config(size: Size, precision: str) -> jaxpets.EnsembleConfig:
