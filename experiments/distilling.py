@@ -185,8 +185,9 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
             now.folder,
         )  # fmt: skip
         own = place(own, SEED)
-        begun = learned.params._replace(actor=own.actor, mean=own.mean, std=own.std)
-        learned = learned._replace(params=begun)
+        if settings.num_rounds:  # the planner's values are others than its critics'
+            own = learned.params._replace(actor=own.actor, mean=own.mean, std=own.std)
+        learned = learned._replace(params=own)
     for turn in range(1, settings.num_rounds + 1):
         keys = now.keys(turn, apart)[..., 0]
         learned, metrics = learn(params, place(keys, SEED), learned, dataset)

@@ -1,4 +1,4 @@
-"""Tasks of HalfCheetah for the study: the paper's four, and twelve that were held out.
+"""Tasks of HalfCheetah for the study: the paper's four, and twelve others.
 
 They were written down before any arm was run on them. None is negative where a robot
 does what it asks, so that a return is a share of what the simulator as the model

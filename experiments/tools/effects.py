@@ -3,7 +3,7 @@
 Reads the zero-shot logs of a study, whose variants are its tags, and prints tables in
 Markdown. A score is a return over that of the simulator as the model, which
 `experiments.tools.simulator --json` has measured. Beside it: what share of the steps
-was upright, and of the reward that was planned, what came.
+was upright, and the return over the value of the plans, which is that of their elites.
 """
 
 import argparse
@@ -134,7 +134,7 @@ def report(found: Results, than: str) -> list[str]:
         lines += [f"## {group}, less `{than}`, %", ""]
         others = [arm for arm in arms if arm != than]
         lines += _by_variant(_less(scores, than), others, _interval)
-    lines += ["## share of upright steps, and of what was planned what came", ""]
+    lines += ["## share of upright steps, and return over the value of the plans", ""]
     lines += _by_variant(found, arms, _shares)
     lines += ["## one variant less another, %", "", *_effects(found, arms)]
     for tag, by_arm in found.items():

@@ -80,6 +80,8 @@ def test_a_policy_can_be_imagined_before_a_planner_is_asked(explored, capsys):
         load_policy(explored / f"{FOLDER}-{tag}" / "policy-0.safetensors")[1]
         for tag in ("imagined", "begun")
     )
+    # Its critics know all that comes, discounted; the rounds' what a plan earns.
+    assert first.scale != then.scale
     # The rounds go on from what was imagined: they see alike, and have moved.
     np.testing.assert_allclose(first.mean, then.mean, atol=1e-6)  # of sums in any order
     weights = [np.concatenate([*map(np.ravel, jax.tree.leaves(x.actor))])

@@ -74,7 +74,7 @@ def test_scores_are_shown_by_arm_and_variant(runs, ceilings, capsys):
     assert "| `random` | - | 0.20 [0.10, 0.30] | - |" in papers
     best = "0.25 [0.25, 0.25] | 0.50 [0.50, 0.50] | 1.00 [0.75, 1.25]"
     assert f"| `best` | {best} |" in others
-    beside = shown["share of upright steps, and of what was planned what came"]
+    beside = shown["share of upright steps, and return over the value of the plans"]
     assert "| `random` | - | 1.00, 0.50 | - |" in beside
 
 
@@ -165,7 +165,10 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
         assert f"| {words} | {' | '.join(cells)} |" in front
 
 
-_IN_THE_JSON = ("the paper's tasks, less `best`, %",)
+_IN_THE_JSON = (
+    "the paper's tasks, less `best`, %",
+    "share of upright steps, and return over the value of the plans",
+)
 _ON_THE_FRONT = ("best", "epistemic", "info-gain", "random")
 
 
