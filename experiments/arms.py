@@ -78,6 +78,7 @@ def make_arm(
         "info-gain": _info_gain,
         "best": _best,
         "ensemble-std": lambda config, model: Arm(rewards.ensemble_std),
+        "plan2explore": _plan2explore,
         "rnd": _rnd,
         "particle-entropy": _particle_entropy,
         **dict.fromkeys(_ONE_STEP, _one_step),
@@ -137,6 +138,24 @@ def _one_step(config: Config, model: jaxpets.Ensemble) -> Arm:
         init=model.init, refresh=lambda _, params, dataset: params
     )
     return Arm(_ONE_STEP[config.arm](model.predict), data)
+
+
+def _plan2explore(config: Config, model: jaxpets.Ensemble) -> Arm:
+    """What is about one step in units of the data, as `best` is about a plan."""
+    del config
+
+    def init(key: Array) -> rewards.Plan2ExploreData:
+        return rewards.Plan2ExploreData(
+            model.init(key), jnp.ones((model.obs_size,), jnp.float32)
+        )
+
+    data = jaxpets.RewardData(
+        init,
+        refresh=lambda _, params, dataset: rewards.Plan2ExploreData(
+            params, jaxpets.datasets.obs_variance(dataset)
+        ),
+    )
+    return Arm(rewards.plan2explore(model.predict), data)
 
 
 def _info_gain(config: Config, model: jaxpets.Ensemble) -> Arm:

@@ -25,6 +25,7 @@ ArmName = Literal[
     "random",
     "oracle",
     "one-step",
+    "plan2explore",
     "info-gain",
     "best",
     "jensen-renyi",
@@ -206,7 +207,7 @@ class Basics:
     """What exploration seeks:
     epistemic: disagreement of the ensemble (SU-PETS);
     best: the same, in units of the data;
-    one-step: disagreement about one step;
+    one-step, plan2explore: disagreement about one step;
     info-gain: the information that a step gives;
     count: rare states; oracle: the first task;
     mixture: the first task and disagreement;

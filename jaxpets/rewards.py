@@ -6,7 +6,13 @@ from jaxpets._src.distillation import (
     random_network_distillation,
 )
 from jaxpets._src.ensemble_params import max_variance
-from jaxpets._src.one_step import jensen_renyi, one_step_disagreement, opax
+from jaxpets._src.one_step import (
+    Plan2ExploreData,
+    jensen_renyi,
+    one_step_disagreement,
+    opax,
+    plan2explore,
+)
 from jaxpets._src.particle_entropy import (
     VisitedStates,
     particle_entropy,
@@ -33,6 +39,7 @@ __all__ = [
     "Distillation",
     "DistillationState",
     "MixtureData",
+    "Plan2ExploreData",
     "PseudoCounts",
     "VisitedStates",
     "count_states",
@@ -47,6 +54,7 @@ __all__ = [
     "opax",
     "particle_entropy",
     "pessimistic",
+    "plan2explore",
     "pseudo_count",
     "random_network_distillation",
     "score",

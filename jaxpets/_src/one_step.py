@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_callable
+from jaxpets._src.checks import check_array, check_callable, check_record
 from jaxpets._src.rewards import check_members
 from jaxpets._src.types import RewardFn
 
@@ -36,6 +36,50 @@ def one_step_disagreement(predict_fn: PredictFn) -> RewardFn:
         return jnp.mean(jnp.sqrt(ratio), -1)
 
     return _one_step(predict_fn, measure)
+
+
+class Plan2ExploreData(NamedTuple):
+    """The data of `plan2explore`.
+
+    Attributes:
+      dynamics: what predict_fn reads.
+      baseline_variance: `[D]`, of the observations so far, in units of obs squared;
+        see `datasets.obs_variance`.
+    """
+
+    dynamics: Any
+    baseline_variance: Array
+
+
+def plan2explore(predict_fn: PredictFn) -> RewardFn:
+    """Builds the reward of Plan2Explore (Sekar et al., 2020), on observations.
+
+    `r = 1/D * sum_k sqrt(v[k] / w[k])` with v of `one_step_disagreement` and w the
+    variance of the data: no noise stands below it. Plan2Explore has the entries of an
+    embedding, of a unit scale each, in place of whitened observations, and the mean of
+    their variances; the root is that of `epistemic` over the same w, from which this
+    differs in that all members predict from one state.
+
+    Args and returns are those of `one_step_disagreement`, as is the cost; the params
+    are Plan2ExploreData. It raises TypeError or ValueError for others.
+    """
+
+    def reward(
+        params: Plan2ExploreData, obs: Array, action: Array, next_obs: Array
+    ) -> Array:
+        check_record("params", params, Plan2ExploreData)
+        check_array("obs", obs, ["E", "P", "D"])
+        check_array("baseline_variance", params.baseline_variance, [obs.shape[-1]])
+
+        def measure(mean: Array, variance: Array) -> Array:
+            del variance
+            ratio = jnp.var(mean, axis=0) / params.baseline_variance
+            return jnp.mean(jnp.sqrt(ratio), -1)
+
+        return _one_step(predict_fn, measure)(params.dynamics, obs, action, next_obs)
+
+    check_callable("predict_fn", predict_fn)
+    return reward
 
 
 def opax(predict_fn: PredictFn) -> RewardFn:

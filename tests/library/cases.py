@@ -249,6 +249,13 @@ CASES = {
     "opax": lambda: Case(
         jaxpets.rewards.opax(MODEL.predict), lambda i: (model(i), *step_of(i))
     ),
+    "of-one-step-in-units-of-data": lambda: Case(
+        jaxpets.rewards.plan2explore(MODEL.predict),
+        lambda i: (
+            jaxpets.rewards.Plan2ExploreData(model(i), jnp.full(2, 1.0 + i)),
+            *step_of(i),
+        ),
+    ),
     "jensen_renyi": lambda: Case(
         jaxpets.rewards.jensen_renyi(MODEL.predict), lambda i: (model(i), *step_of(i))
     ),

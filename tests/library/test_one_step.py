@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import toys
 
-from jaxpets.rewards import jensen_renyi, one_step_disagreement, opax
+from jaxpets.rewards import (
+    Plan2ExploreData,
+    jensen_renyi,
+    one_step_disagreement,
+    opax,
+    plan2explore,
+)
 
 E, P, D = 5, 4, 6
 EVERY = pytest.mark.parametrize("build", [one_step_disagreement, opax, jensen_renyi])
@@ -42,6 +48,38 @@ def test_one_step_disagreement_equals_the_reference():
     ratio = means.var(0) / np.float64(variance).mean(0)
     want = np.sqrt(ratio).mean(-1)
     np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_plan2explore_is_in_units_of_the_data():
+    """The same in float64; what the members say of their noise does not count."""
+    weight, variance = some_members()
+    obs = some_particles()
+    data = np.random.default_rng(2).uniform(0.5, 2, size=D).astype(np.float32)
+    fn = jax.jit(plan2explore(affine))
+    step = (jnp.asarray(obs), jnp.ones(2), jnp.zeros((E, P, D)))
+    got = fn(Plan2ExploreData((weight, variance), data), *step)
+    assert got.shape == (E, P)
+    means = np.float64(weight)[:, None, None] * np.float64(obs)[None] + 2.0
+    want = np.sqrt(means.var(0) / np.float64(data)).mean(-1)
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+    np.testing.assert_array_equal(
+        fn(Plan2ExploreData((weight, 3 * variance), data), *step), got
+    )
+
+
+def test_what_does_not_fit_plan2explore_is_refused():
+    fn, obs = plan2explore(affine), jnp.zeros((E, P, D))
+    with pytest.raises(TypeError, match="predict_fn must be a function, got None"):
+        plan2explore(None)
+    with pytest.raises(TypeError, match="params must be a Plan2ExploreData"):
+        fn(some_members(), obs, jnp.ones(2), obs)
+    for size, given, words in (
+        (D + 1, obs, r"baseline_variance must be float32\[6\], got"),
+        (D, obs[0], r"obs must be float32\[E, P, D\], got"),
+    ):
+        params = Plan2ExploreData(some_members(), jnp.ones(size))
+        with pytest.raises(ValueError, match=words):
+            fn(params, given, jnp.ones(2), given)
 
 
 @EVERY
