@@ -25,7 +25,8 @@ from jaxpets.envs import half_cheetah
 
 COLUMNS = ("added_ms", "act_ms", "act_p99_ms", "plan_ms", "plan_p99_ms", "size",
            "engine")  # fmt: skip
-OF_POLICY = ("onnx_us", "onnx_min_us", "jax_us", "jax_min_us", "hidden_size")
+OF_POLICY = ("onnx_us", "onnx_min_us", "onnx_p99_us", "jax_us", "jax_min_us",
+             "jax_p99_us", "hidden_size")  # fmt: skip
 Call = Callable[[], np.ndarray]
 
 
@@ -88,8 +89,10 @@ def policy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         {"hidden_size": size},
         onnx_us=1e3 * onnx.median_ms,
         onnx_min_us=1e3 * onnx.min_ms,
+        onnx_p99_us=1e3 * onnx.p99_ms,
         jax_us=1e3 * own.median_ms,
         jax_min_us=1e3 * own.min_ms,
+        jax_p99_us=1e3 * own.p99_ms,
         repeats=args.repeats,
     )
 
