@@ -14,7 +14,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator, ScalarFormatter
 
-from benchmarks import workloads
+from benchmarks import costs, workloads
 from experiments.report import style
 
 PEERS = Path(__file__).parent / "results" / "peers.jsonl"
@@ -61,8 +61,8 @@ def plans(rows: Iterable[Row]) -> list[Row]:
 def floor_ms(num_samples: int, device: str) -> float:
     """Returns what the matrix products of a plan take at the device's peak."""
     size = dataclasses.replace(_PAPER, num_samples=num_samples)
-    candidates = workloads.candidates_per_action(size, "cem")
-    return 1e3 * workloads.rollout_flops(size, candidates) / PEAK_FLOPS[device]
+    candidates = costs.candidates_per_action(size, "cem")
+    return 1e3 * costs.rollout_flops(size, candidates) / PEAK_FLOPS[device]
 
 
 def points(rows: Iterable[Row], over: str, engine: str) -> list[tuple[int, float]]:

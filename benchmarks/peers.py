@@ -9,8 +9,6 @@ first call, in which torch compiles.
 
 import argparse
 import dataclasses
-import math
-import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks import rows, timing, workloads
+from benchmarks import costs, rows, timing, workloads
 from jaxpets.envs import half_cheetah
 
 COLUMNS = ("program", "engine", "precision", "num_samples", "horizon", "steps",
@@ -58,13 +56,10 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for name, build in (("tdmpc2", tdmpc2), ("hydrax", hydrax)):
         if (checkout := getattr(args, name)) is not None:
             programs.append(peer(name, build, checkout))
-    results = in_turn([program.plan for program in programs], args.repeats)
-    for program, seconds in zip(programs, results, strict=True):
-        ms = sorted(1e3 * second for second in seconds)
-        p99 = ms[math.ceil(0.99 * len(ms)) - 1]
-        result = timing.Timing(
-            program.compile_s, ms[0], statistics.median(ms), p99, len(ms)
-        )
+    plans = [program.plan for program in programs]
+    turns = timing.in_turn(*plans, repeats=args.repeats, warm_ups=WARM_UPS)
+    for program, seconds in zip(programs, zip(*turns, strict=True), strict=True):
+        result = timing.summary(seconds, program.compile_s)
         yield rows.make_row(
             "peers",
             program.sizes,
@@ -72,17 +67,6 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             peer=program.peer,
             **result._asdict(),
         )
-
-
-def in_turn(
-    plans: Sequence[Callable[[], np.ndarray]], repeats: int
-) -> list[tuple[float, ...]]:
-    """Returns the seconds of each program, after runs that do not count."""
-    for plan in plans:
-        for _ in range(WARM_UPS):
-            plan()
-    turns = [[timing.seconds(plan) for plan in plans] for _ in range(repeats)]
-    return list(zip(*turns, strict=True))
 
 
 def peer(name: str, build: Callable[[Path], Program], checkout: Path) -> Program:
@@ -116,7 +100,7 @@ def ours(name: str, engine: str, precision: str) -> Program:
     return Program(
         {"program": f"jaxpets {name}", "engine": engine, "precision": precision,
          **dataclasses.asdict(size)},
-        workloads.candidates_per_action(size, "cem") * size.horizon
+        costs.candidates_per_action(size, "cem") * size.horizon
         * size.num_particles,
         compile_s,
         lambda: np.asarray(step(*inputs)[0].action),

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import jaxpets
-from benchmarks import rows, timing, workloads
+from benchmarks import costs, rows, timing, workloads
 
 COLUMNS = (
     "engine", "precision", "seeds", "plans", "num_samples", "horizon", "compile_s",
@@ -56,9 +56,9 @@ def measure(
     step, compile_s = timing.compile_program(jax.vmap(program), *inputs)
     call = functools.partial(step, *inputs)
     result = timing.repeat(call, compile_s, repeats=args.repeats)
-    candidates = workloads.candidates_per_action(size, args.optimizer)
+    candidates = costs.candidates_per_action(size, args.optimizer)
     plans = seeds * args.plans
-    flops = plans * workloads.rollout_flops(size, candidates)
+    flops = plans * costs.rollout_flops(size, candidates)
     sizes = {
         **dataclasses.asdict(size),
         "precision": precision,

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from benchmarks import rows, timing, workloads
+from benchmarks import costs, rows, timing, workloads
 
 COLUMNS = ("engine", "precision", "compile_s", "min_ms", "median_ms", "us_per_step",
            "tflops_per_s")  # fmt: skip
@@ -18,7 +18,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for engine, precision in itertools.product(args.engine, args.precision):
         rollout, inputs = workloads.rollout_work(size, precision, engine)
         result = timing.measure(rollout, *inputs, repeats=args.repeats)
-        flops = workloads.rollout_flops(size, size.num_samples)
+        flops = costs.rollout_flops(size, size.num_samples)
         yield rows.make_row(
             "rollout",
             {**dataclasses.asdict(size), "precision": precision, "engine": engine},

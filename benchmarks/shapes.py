@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 import jaxpets
 from benchmarks import rows, timing, workloads
+from experiments.cost import model_flops
 
 COLUMNS = ("shape", "compile_s", "median_ms", "tflops_per_s", "share_of_paper")
 _CHEETAH = (18, 6, (200,) * 4)
@@ -98,7 +99,7 @@ def _flops(shape: Shape) -> float:
     """Returns the operations in matrix products, two per multiply-add."""
     widths = (shape.obs_size + shape.action_size, *shape.hidden_sizes)
     steps = shape.num_samples * shape.num_particles * shape.horizon
-    return steps * workloads.model_flops((*widths, 2 * shape.obs_size))
+    return steps * model_flops((*widths, 2 * shape.obs_size))
 
 
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:

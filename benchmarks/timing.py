@@ -3,7 +3,7 @@
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -45,12 +45,17 @@ def seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
+def summary(times: Sequence[float], compile_s: float) -> Timing:
+    """Returns what the seconds of several runs come to."""
+    ms = sorted(1e3 * time for time in times)
+    p99 = ms[math.ceil(0.99 * len(ms)) - 1]
+    return Timing(compile_s, ms[0], statistics.median(ms), p99, len(ms))
+
+
 def repeat(call: Callable[[], Any], compile_s: float = 0.0, *, repeats: int) -> Timing:
     """Runs something compiled once unmeasured and then `repeats` times."""
     seconds(call)
-    times = sorted(1e3 * seconds(call) for _ in range(repeats))
-    p99 = times[math.ceil(0.99 * repeats) - 1]
-    return Timing(compile_s, times[0], statistics.median(times), p99, repeats)
+    return summary([seconds(call) for _ in range(repeats)], compile_s)
 
 
 def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:
@@ -60,16 +65,17 @@ def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:
 
 
 def in_turn(
-    first: Callable[[], Any], second: Callable[[], Any], *, repeats: int
-) -> list[tuple[float, float]]:
-    """Runs two callables in turn, so that both see the same state of the machine.
+    *calls: Callable[[], Any], repeats: int, warm_ups: int = 1
+) -> list[tuple[float, ...]]:
+    """Runs callables in turn, so that all see the same state of the machine.
 
     Returns:
-      The seconds of both, `repeats` times, after one run of each that does not count.
+      The seconds of each, `repeats` times, after runs of each that do not count.
     """
-    seconds(first)
-    seconds(second)
-    return [(seconds(first), seconds(second)) for _ in range(repeats)]
+    for call in calls:
+        for _ in range(warm_ups):
+            seconds(call)
+    return [tuple(seconds(call) for call in calls) for _ in range(repeats)]
 
 
 def compare(

@@ -141,21 +141,21 @@ def _one_step(config: Config, model: jaxpets.Ensemble) -> Arm:
 
 
 def _plan2explore(config: Config, model: jaxpets.Ensemble) -> Arm:
-    """What is about one step in units of the data, as `best` is about a plan."""
-    del config
+    """What is about one step, in the units of `best`."""
+    unit = _best(config, model).reward_data
 
     def init(key: Array) -> rewards.Plan2ExploreData:
-        return rewards.Plan2ExploreData(
-            model.init(key), jnp.ones((model.obs_size,), jnp.float32)
-        )
+        return rewards.Plan2ExploreData(model.init(key), unit.init(key))
 
-    data = jaxpets.RewardData(
-        init,
-        refresh=lambda _, params, dataset: rewards.Plan2ExploreData(
-            params, jaxpets.datasets.obs_variance(dataset)
-        ),
-    )
-    return Arm(rewards.plan2explore(model.predict), data)
+    def refresh(
+        data: rewards.Plan2ExploreData,
+        params: jaxpets.EnsembleParams,
+        dataset: jaxpets.typing.Dataset,
+    ) -> rewards.Plan2ExploreData:
+        baseline = unit.refresh(data.baseline_variance, params, dataset)
+        return rewards.Plan2ExploreData(params, baseline)
+
+    return Arm(rewards.plan2explore(model.predict), jaxpets.RewardData(init, refresh))
 
 
 def _info_gain(config: Config, model: jaxpets.Ensemble) -> Arm:

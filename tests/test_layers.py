@@ -412,6 +412,11 @@ def test_sizes_stay_small_outside(name):
     assert len(path_of(name).read_text().splitlines()) <= 300
 
 
+def test_sizes_of_benchmarks_stay_small():
+    for path in REPOSITORY.joinpath("benchmarks").glob("*.py"):
+        assert len(path.read_text().splitlines()) <= 300, path.name
+
+
 @pytest.mark.parametrize("module", MODULES_OF_NAMES)
 def test_public_names_are_those_listed(module):
     public = {

@@ -63,22 +63,21 @@ def plan2explore(predict_fn: PredictFn) -> RewardFn:
     Args and returns are those of `one_step_disagreement`, as is the cost; the params
     are Plan2ExploreData. It raises TypeError or ValueError for others.
     """
+    check_callable("predict_fn", predict_fn)
 
     def reward(
         params: Plan2ExploreData, obs: Array, action: Array, next_obs: Array
     ) -> Array:
         check_record("params", params, Plan2ExploreData)
-        check_array("obs", obs, ["E", "P", "D"])
-        check_array("baseline_variance", params.baseline_variance, [obs.shape[-1]])
+        baseline = params.baseline_variance
 
         def measure(mean: Array, variance: Array) -> Array:
             del variance
-            ratio = jnp.var(mean, axis=0) / params.baseline_variance
-            return jnp.mean(jnp.sqrt(ratio), -1)
+            check_array("baseline_variance", baseline, [mean.shape[-1]])
+            return jnp.mean(jnp.sqrt(jnp.var(mean, axis=0) / baseline), -1)
 
         return _one_step(predict_fn, measure)(params.dynamics, obs, action, next_obs)
 
-    check_callable("predict_fn", predict_fn)
     return reward
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks import (
     agent,
+    costs,
     env,
     fit,
     model_quality,
@@ -101,11 +102,11 @@ def test_repeat_leaves_the_first_run_out():
 
 def test_work_of_the_paper_is_what_is_published():
     size = workloads.named_size("paper")
-    candidates = workloads.candidates_per_action(size, "cem")
+    candidates = costs.candidates_per_action(size, "cem")
     assert candidates == 2500
-    assert workloads.rollout_flops(size, candidates) == 396e9
+    assert costs.rollout_flops(size, candidates) == 396e9
     # iCEM: 500, 400, 320, 256, 204, with 15 elites kept in each and the last mean.
-    assert workloads.candidates_per_action(size, "icem") == 1680 + 5 * 15 + 1
+    assert costs.candidates_per_action(size, "icem") == 1680 + 5 * 15 + 1
 
 
 def test_plan_over_seeds_and_samples(tmp_path):
@@ -124,7 +125,7 @@ def test_plan_over_seeds_and_samples(tmp_path):
     check_rows(found, path, results, labels)
     assert found[0].items() >= labels.items()
     size = workloads.named_size("tiny")
-    flops = workloads.rollout_flops(size, size.num_samples * size.num_iterations)
+    flops = costs.rollout_flops(size, size.num_samples * size.num_iterations)
     assert found[0]["gflop"] == pytest.approx(2 * flops / 1e9)
     flags = "--seeds 1 --num-samples 8 --horizon 2 --optimizer icem --reward task"
     found = plan.main([*flags.split(), "--precision", "f32", *common])

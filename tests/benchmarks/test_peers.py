@@ -66,10 +66,10 @@ def test_rows_of_a_peer_and_of_ours(tmp_path, monkeypatch):
 def test_programs_run_in_turn_after_the_same_warm_up():
     order = []
     plans = [lambda: order.append("first"), lambda: order.append("second")]
-    seconds = peers.in_turn(plans, repeats=4)
+    turns = timing.in_turn(*plans, repeats=4, warm_ups=peers.WARM_UPS)
     warm_up = ["first"] * peers.WARM_UPS + ["second"] * peers.WARM_UPS
     assert order == warm_up + ["first", "second"] * 4
-    assert [len(of_one) for of_one in seconds] == [4, 4]
+    assert [len(of_one) for of_one in zip(*turns, strict=True)] == [4, 4]
 
 
 def test_our_plan_is_that_of_the_program_plan():

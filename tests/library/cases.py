@@ -4,6 +4,7 @@ Arguments are arrays of NumPy: to make them, nothing is compiled.
 """
 
 import functools
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -249,7 +250,7 @@ CASES = {
     "opax": lambda: Case(
         jaxpets.rewards.opax(MODEL.predict), lambda i: (model(i), *step_of(i))
     ),
-    "of-one-step-in-units-of-data": lambda: Case(
+    "plan2explore": lambda: Case(
         jaxpets.rewards.plan2explore(MODEL.predict),
         lambda i: (
             jaxpets.rewards.Plan2ExploreData(model(i), jnp.full(2, 1.0 + i)),
@@ -271,5 +272,9 @@ CASES = {
         lambda i: (mixed(i), *step_of(i)),
     ),
 }
-STATEFUL = [name for name in CASES if "plan" in name or name in toys.OPTIMIZERS]
+STATEFUL = [
+    name
+    for name in CASES
+    if {"plan", "planner"} & set(re.split("[-_]", name)) or name in toys.OPTIMIZERS
+]
 KEYED = [*STATEFUL, "particle_rollout", "particle_rollout-ensemble", "per_state"]
