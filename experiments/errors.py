@@ -13,13 +13,17 @@ def printable(text: str) -> str:
     return "".join(safe)
 
 
-class RunError(Exception):
-    """A failure that is not a bug; its message is one line for the user."""
+class RunEnd(BaseException):
+    """What ends a run and is not a bug; its message is one line for the user."""
 
     exit_code = 1
 
     def __str__(self) -> str:
         return printable(super().__str__()).replace("\n", "\\n")
+
+
+class RunError(RunEnd, Exception):
+    """A failure that is not a bug."""
 
 
 class UsageError(RunError):
@@ -52,11 +56,13 @@ class OutOfMemoryError(RunError):
     exit_code = 6
 
 
-class InterruptedRun(RunError, KeyboardInterrupt):
+class InterruptedRun(RunEnd, KeyboardInterrupt):
     """A signal; the same command goes on from the last checkpoint.
 
-    It is a KeyboardInterrupt too, as asyncio lets that through. Orbax saves in asyncio,
-    which logs any other error of a callback, and forgets it.
+    It may be raised anywhere, and is no Exception, as others forgive those: jax, for
+    one, where it writes to its cache. It is a KeyboardInterrupt, as asyncio lets that
+    through. Orbax saves in asyncio, which logs any other error of a callback, and
+    forgets it.
     """
 
     exit_code = 75
@@ -72,9 +78,9 @@ class ExitCode(int):
     Programs of XLA that still run may use what the frames of the error hold.
     """
 
-    error: RunError
+    error: RunEnd
 
-    def __new__(cls, error: RunError) -> "ExitCode":
+    def __new__(cls, error: RunEnd) -> "ExitCode":
         """Takes the number from the error."""
         code = super().__new__(cls, error.exit_code)
         code.error = error
@@ -91,7 +97,7 @@ def stop_behind(error: BaseException | None) -> InterruptedRun | None:
     return error and type(error)(*error.args)
 
 
-def last_line(error: RunError) -> str:
+def last_line(error: RunEnd) -> str:
     """Returns what the user is told of the end of a run."""
     if isinstance(error, InterruptedRun):
         return (
@@ -103,7 +109,7 @@ def last_line(error: RunError) -> str:
 
 def reason(error: BaseException) -> str:
     """Returns in one line why a run ended."""
-    if isinstance(error, RunError):
+    if isinstance(error, RunEnd):
         return str(error)
     line, *_ = [*str(error).splitlines(), ""]
     return f"{type(error).__name__}: {line}".rstrip(": ")

@@ -17,6 +17,7 @@ from .errors import (
     CheckpointError,
     ExitCode,
     OutOfMemoryError,
+    RunEnd,
     RunError,
     StorageError,
     UsageError,
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None, watch: Watch | None = None) -> int:
             config = from_json(plain, Config())
             with _plain_errors(config):
                 _dispatch(config, watch or Watch())
-    except RunError as error:
+    except RunEnd as error:
         if "--debug" in arguments:
             traceback.print_exc()
         signals.say(last_line(error))
@@ -187,7 +188,7 @@ def _plain_errors(config: Config) -> Iterator[None]:
         raise plain from error
 
 
-def _plain(error: Exception, config: Config) -> RunError | None:
+def _plain(error: Exception, config: Config) -> RunEnd | None:
     if (stop := stop_behind(error)) is not None:
         return stop
     full = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)

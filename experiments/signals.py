@@ -60,9 +60,9 @@ def stoppable() -> Iterator[Stop]:
     """Turns the first signal into InterruptedRun, or into the end of the process.
 
     That is SIGINT, SIGTERM or SIGHUP, wherever the program is, for as long as this is
-    held. `first_signal`, inside, may do something else with it. What is not left within
-    seconds is ended: the process tells the Stop, and exits with the code of
-    InterruptedRun. A second signal ends it at once.
+    held; no `except Exception` catches it. `first_signal`, inside, may do something
+    else with it. What is not left within seconds is ended: the process tells the Stop,
+    and exits with the code of InterruptedRun. A second signal ends it at once.
     """
 
     def stop(number: int) -> None:

@@ -18,6 +18,7 @@ from .. import errors
 from ..errors import (
     InterruptedRun,
     OutOfMemoryError,
+    RunEnd,
     RunError,
     StoppedTogether,
     UsageError,
@@ -74,9 +75,8 @@ def joined(spec: ProcessSpec | None) -> Iterator[None]:
 
 
 def _is_known_to_all(error: BaseException) -> bool:
-    if isinstance(error, InterruptedRun):
-        return isinstance(error, StoppedTogether)
-    return isinstance(error, RunError) and not isinstance(error, OutOfMemoryError)
+    together = isinstance(error, (RunError, StoppedTogether))
+    return together and not isinstance(error, OutOfMemoryError)
 
 
 def _leave() -> None:
@@ -99,16 +99,16 @@ def is_first() -> bool:
 
 
 def on_first(call: Callable[[], Any]) -> Any:
-    """Calls on process 0 only; all processes get the JSON value or the RunError."""
+    """Calls on process 0 only; all processes get the JSON value or the RunEnd."""
     if is_alone():
         return call()
     answer, failure = {}, None
     if is_first():
         try:
             answer = {"value": call()}
-        except Exception as error:
+        except (Exception, RunEnd) as error:
             failure = error
-            kind = error if isinstance(error, RunError) else RunError()
+            kind = error if isinstance(error, RunEnd) else RunError()
             words = str(error) or type(error).__name__
             answer = {"kind": type(kind).__name__, "words": words}
     data = np.frombuffer(json.dumps(answer).encode(), np.uint8)

@@ -245,7 +245,7 @@ def _read(
     except PermissionError as error:
         what = f"cannot read checkpoint {number} in {directory} ({error.strerror})"
         raise StorageError(f"{what}. Check its permissions.") from error
-    except (MemoryError, RunError, _DamagedError):  # a signal is none of its damage
+    except (MemoryError, RunError, _DamagedError):
         raise
     except Exception as error:
         if stop := stop_behind(error):

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import InterruptedRun, UsageError
+from ..errors import UsageError
 from ..parallel import distributed
 from . import disk, identity, rundir
 
@@ -105,8 +105,6 @@ class Tracked:
                 self._tracker = _OPEN[self._kind](self._about(step))
                 distributed.say(f"tracked: {self._tracker.where}")
             send(self._tracker)
-        except InterruptedRun:
-            raise
         except Exception as error:
             self._give_up(_line(error))
 
@@ -199,7 +197,7 @@ def _wandb(about: About) -> Tracker:
     try:
         run = begun(mode)
     except Exception as error:
-        if mode != "online" or isinstance(error, InterruptedRun):
+        if mode != "online":
             raise
         distributed.say(f"warning: wandb is offline: {_line(error)}")
         wandb.teardown()  # it holds the id

@@ -218,11 +218,21 @@ def test_two_seeds_through_all_phases(
     folder = runs.copied(explored_once(0, 7).folder, tmp_path)
     _check_side_by_side(folder, straight.folder)
 
-    # A video that cannot be made does not fail the run that it shows.
     monkeypatch.setenv("MUJOCO_GL", "crayons")
     task = ("--from", str(folder), "--task", "back-flip")
     video = ("--video", str(tmp_path / "a.mp4"))
-    assert main(["--phase", "zero-shot", *task, "--eval-trials", "2", *video]) == 0
+    zero_shot = ["--phase", "zero-shot", *task, "--eval-trials", "2", *video]
+    # A signal stops a run at its video too, where the same command goes on.
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            "experiments.tools.video.render",
+            lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM),
+        )
+        assert main(zero_shot) == 75
+    assert "\nstopped: SIGTERM; " in capsys.readouterr().err
+    assert status(folder / "zero-shot-003-back-flip") == "interrupted"
+    # A video that cannot be made does not fail the run that it shows.
+    assert main(zero_shot) == 0
     errors = capsys.readouterr().err
     assert "warning: no video; the run is complete: cannot render" in errors
     assert os.environ["MUJOCO_GL"] == "crayons"

@@ -1,6 +1,7 @@
 """How a run is stopped: by its first signal, in time, or else without it."""
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -47,6 +48,28 @@ DEAF = """
     signals.as_program(run.main)
 """
 
+# A signal while jax writes a program to its cache, where it forgives every Exception.
+CACHING = """
+    import os
+    import signal
+    import sys
+    import jax
+    from experiments import signals
+    from experiments.errors import InterruptedRun
+    folder = sys.argv[1]
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    def opening(event, args):
+        if event == "open" and str(args[0]).startswith(folder):
+            os.kill(os.getpid(), signal.SIGTERM)
+    sys.addaudithook(opening)
+    try:
+        with signals.stoppable():
+            jax.jit(lambda x: x + 1)(1)
+    except InterruptedRun as error:
+        print(error)
+"""
+
 # XLA may still be at work on what the frames of a run that was stopped hold.
 HELD = """
     from experiments import cli, errors, run, signals
@@ -81,6 +104,21 @@ def test_a_signal_stops_what_is_stoppable(name, hung_up):
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     assert signal.getsignal(number) is before
     assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_who_forgives_errors_forgives_no_signal():
+    with pytest.raises(InterruptedRun, match="SIGTERM"), signals.stoppable():
+        with contextlib.suppress(Exception):
+            os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("it goes on")
+
+
+def test_a_signal_stops_jax_while_it_writes_to_its_cache(tmp_path):
+    argv = [sys.executable, "-c", textwrap.dedent(CACHING), str(tmp_path / "cache")]
+    found = subprocess.run(
+        argv, check=False, cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert (found.returncode, found.stdout, found.stderr) == (0, "SIGTERM\n", "")
 
 
 def test_before_there_is_a_run_nothing_can_swallow_ctrl_c():
