@@ -14,7 +14,7 @@ from .errors import RunError, UsageError
 _PHASES = {
     "explore": "learn a model of a robot, without a reward",
     "zero-shot": "perform tasks with an explored model",
-    "distill": "learn a policy that acts as the planner would",
+    "distill": "learn a policy that performs tasks without a plan",
     "finetune": "go on learning, with the rewards of tasks",
     "report": "make tables and figures of all runs",
 }

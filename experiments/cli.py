@@ -185,5 +185,5 @@ def _check_file(config: Config) -> None:
         valid = "0; a file of a model has no data"
         epochs, updates = config.refit.num_epochs, config.critic.num_updates
         require(epochs == 0, "--refit.num-epochs", epochs, valid)
-        if config.phase != "distill":  # where the planner performs at first
+        if config.phase != "distill":  # which imagines from what the planner does
             require(updates == 0, "--critic.num-updates", updates, valid)

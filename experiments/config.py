@@ -20,22 +20,10 @@ from .storage.rundir import HALF_CHEETAH
 Phase = Literal["explore", "zero-shot", "finetune", "distill", "report"]
 Preset = Literal["laptop", "paper", "smoke"]
 ArmName = Literal[
-    "epistemic",
-    "count",
-    "random",
-    "oracle",
-    "one-step",
-    "plan2explore",
-    "info-gain",
-    "best",
-    "jensen-renyi",
-    "opax",
-    "ensemble-std",
-    "rnd",
-    "particle-entropy",
-    "mixture",
-    "pink-noise",
-]
+    "epistemic", "count", "random", "oracle", "one-step", "plan2explore", "info-gain",
+    "best", "jensen-renyi", "opax", "ensemble-std", "rnd", "particle-entropy",
+    "mixture", "pink-noise",
+]  # fmt: skip
 # Arms that act without a plan, and what a log calls the planner of each.
 UNPLANNED = {"random": "random", "pink-noise": "noise"}
 # Arms that one network will do for.
@@ -139,23 +127,19 @@ class PlannerConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class CriticConfig:
-    """An actor and a critic of every task, or of all for distill, that imagine."""
+class ImaginationConfig:
+    """An actor and a critic of all tasks, from which the policy of distill begins."""
 
     num_updates: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
-    """Gradient steps, at least; 0: no critic, a plan ends with its horizon."""
-    acts: bool = False
-    """The actor acts alone: nothing is planned."""
+    """Gradient steps, at least; 0: there is no critic."""
     learning_rate: Annotated[float, Meta(ge=1e-9, le=1.0)] = 1e-3
     """Of Adam, at first; it falls to a twentieth."""
-    hidden_size: Annotated[int, Meta(ge=1, le=8192)] = ActorCriticConfig.hidden_size
-    """Width of the networks' layers."""
     batch_size: Annotated[int, Meta(ge=1, le=65_536)] = ActorCriticConfig.batch_size
     """Imagined rows per gradient step, at least."""
     horizon: Annotated[int, Meta(ge=1, le=1000)] = ActorCriticConfig.horizon
     """Steps that are imagined in a gradient step."""
     discount: Annotated[float, Meta(ge=0.0, le=0.9999)] = 0.99
-    """Per step of the environment, also of plans that end with the critic."""
+    """Per step of the environment, also of zero-shot's plans."""
     trace: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
     """lambda of the returns that the critic learns."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.5
@@ -169,10 +153,20 @@ class CriticConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class DistillingConfig:
-    """A policy for all tasks that acts as the planner would, without a plan."""
+class CriticConfig(ImaginationConfig):
+    """zero-shot: an actor and a critic of every task, with which a plan ends."""
 
-    num_rounds: Annotated[int, Meta(ge=0, le=10_000)] = 10
+    hidden_size: Annotated[int, Meta(ge=1, le=8192)] = ActorCriticConfig.hidden_size
+    """Width of the networks' layers."""
+    acts: bool = False
+    """The actor acts alone: nothing is planned."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DistillingConfig:
+    """A policy for all tasks that acts without a plan."""
+
+    num_rounds: Annotated[int, Meta(ge=0, le=10_000)] = 0
     """Times that the planner is asked, the policy learns and acts; 0: as imagined."""
     num_trials: Annotated[int, Meta(ge=1, le=10_000)] = DistillConfig.num_trials
     """Imagined trials side by side in which the planner is asked, at least."""
@@ -184,6 +178,7 @@ class DistillingConfig:
     """Of Adam, at first; it falls to a twentieth."""
     hidden_size: Annotated[int, Meta(ge=1, le=8192)] = DistillConfig.hidden_size
     """Width of the policy's two layers."""
+    critic: ImaginationConfig = ImaginationConfig(60_000, batch_size=1024, horizon=10)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Sequence
 
 from . import robots
-from .config import UNPLANNED, Config, PlannerConfig
+from .config import UNPLANNED, Config, ImaginationConfig, PlannerConfig
 from .errors import UsageError
 
 # Floating-point operations that a CPU does in an hour, about 100 GFLOP/s.
@@ -75,9 +75,10 @@ def memory_advice(config: Config) -> str:
     seeds, trials = len(config.seeds), _num_tasks(config)
     flags = [f"--{group}.num-samples", f"--{group}.num-particles"]
     learned = ""
-    if critics := _num_critics(config):
+    own, _, critics = _imagined(config)
+    if critics:
         learned = f"{critics} critics learn at once, and "
-        flags = ["--critic.batch-size", *flags[: 2 * (not config.critic.acts)]]
+        flags = [f"--{own}.batch-size", *flags[: 2 * (not config.critic.acts)]]
     if config.phase == "zero-shot":
         trials *= config.eval_trials
         flags.insert(0, "--eval-trials")
@@ -101,17 +102,21 @@ def _search(config: Config) -> tuple[str, PlannerConfig]:
 
 def _critic_steps(config: Config) -> int:
     """Returns about as many imagined steps as critics cost."""
-    critic = config.critic
+    _, critic, count = _imagined(config)
     rows = critic.num_updates * critic.batch_size * critic.horizon
-    return 3 * rows * _num_critics(config)  # the networks cost about twice the model
+    return 7 * rows * count  # the networks cost about six times the model
 
 
-def _num_critics(config: Config) -> int:
-    """Returns how many critics learn at once; of distill one has all tasks."""
-    if not config.critic.num_updates or config.phase not in ("zero-shot", "distill"):
-        return 0
-    tasks = _num_tasks(config) if config.phase == "zero-shot" else 1
-    return len(config.seeds) * tasks
+def _imagined(config: Config) -> tuple[str, ImaginationConfig, int]:
+    """Returns what the flags of critics are called, and how many learn at once.
+
+    Of distill one has all tasks.
+    """
+    group, critic, tasks = "critic", config.critic, _num_tasks(config)
+    if config.phase == "distill":
+        group, critic, tasks = "distill.critic", config.distill.critic, 1
+    learns = critic.num_updates and config.phase in ("zero-shot", "distill")
+    return group, critic, len(config.seeds) * tasks if learns else 0
 
 
 def _num_tasks(config: Config) -> int:

@@ -1,7 +1,7 @@
-"""Phase 2 in a network: what the planner would do on any task, without a plan.
+"""Phase 2 in a network: one policy of all tasks, which acts without a plan.
 
-The planner performs every task; what it sees is data to imagine from. With a critic the
-policy first learns from imagination alone. Then, round by round, it is asked in
+The planner performs every task; what it sees is data to imagine from. The policy first
+learns from imagination alone. Then, in rounds if there are any, the planner is asked in
 imagined trials, where its search begins with what the policy would do; the policy
 learns what it said, and acts once per task, from where the next round imagines. At last
 the policy performs as the planner did, and so does the planner that begins with it.
@@ -178,7 +178,7 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     # With the keys of places that no task has: those of tasks are for trials.
     apart = [len(now.parts.robot.tasks.names)]
     learned = init(params, place(now.keys(0, apart)[..., 0], SEED), dataset)
-    if now.config.critic.num_updates:
+    if settings.critic.num_updates:
         keys = place(now.keys(0, [apart[0] + 1])[..., 0], SEED)
         own = imagined_policy.learned(
             now.config, now.parts, now.tasks, now.placement, params, keys, dataset,

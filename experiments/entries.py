@@ -162,19 +162,23 @@ def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
       CheckpointError: if one of them cannot be read.
     """
     now, then = from_json(new, Config()), from_json(old, Config(), where)
-    unsaid = {
-        name: getattr(now, name)
-        for name, hint in hints(Config).items()
-        if dataclasses.is_dataclass(hint) and name not in old
-    }
-    then = dataclasses.replace(then, **unsaid)
     pairs = {
         entry.name: (entry.of(then), entry.of(now))
         for entry in entries(Run)
-        if Mark.GOAL not in entry.marks
+        if Mark.GOAL not in entry.marks and _has_group(old, entry.name)
     }
     return [
         f"{name}: {to_json(pair[0])} (there) vs {to_json(pair[1])} (now)"
         for name, pair in sorted(pairs.items())
         if pair[0] != pair[1]
     ]
+
+
+def _has_group(data: Any, name: str) -> bool:
+    """Returns whether JSON has the groups that an entry of this name is in."""
+    *groups, _ = name.split(".")
+    for group in groups:
+        if group not in data:
+            return False
+        data = data[group]
+    return True

@@ -51,7 +51,7 @@ class Finetune(ZeroShot):
 
 @dataclasses.dataclass(frozen=True)
 class Distill(ZeroShot):
-    """Phase 2 in a network: acts as the planner would, on any task.
+    """Phase 2 in a network: performs any task without a plan.
 
     Settings are those of the exploration run unless a flag says otherwise.
     """

@@ -15,7 +15,7 @@ from jaxpets.policies import ActorCriticParams
 
 from . import critic
 from .build import Parts, imagined_end
-from .config import Config
+from .config import Config, CriticConfig
 from .parallel.devices import SEED, Placement
 from .policy import family
 from .storage.folder import RunFolder
@@ -41,7 +41,7 @@ def learned(
     """Returns an actor and critics `[S]` that see the task, as the distiller's do.
 
     Args:
-      config: with the numbers of a critic, of which the width is the distiller's.
+      config: with the numbers of distill, which also has the width of the networks.
       parts: made with it.
       tasks: the family.
       placement: of seeds.
@@ -50,10 +50,9 @@ def learned(
       dataset: `[S]`, where imagined trials begin.
       run: that is told.
     """
-    width = config.distill.hidden_size
-    config = dataclasses.replace(
-        config, critic=dataclasses.replace(config.critic, hidden_size=width)
-    )
+    own = config.distill
+    numbers = CriticConfig(**vars(own.critic), hidden_size=own.hidden_size)
+    config = dataclasses.replace(config, critic=numbers)
     robot = parts.robot
     actor = critic.make_critic(
         config, robot, parts.model, imagined_end(robot.env),

@@ -5,7 +5,7 @@ performs, but there are no data to learn on.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -64,18 +64,27 @@ class ModelFile(NamedTuple):
 Source: TypeAlias = "RunFolder | ModelFile"  # what a later phase starts from
 
 
-def named(source: Path) -> Path:
+def named(
+    source: Path,
+    flag: str = "--from",
+    shipped: Callable[[str], Path] = models.path,
+) -> Path:
     """Returns the path of a file or folder, which may be called `pretrained/NAME`.
 
+    Args:
+      source: as the command line names it.
+      flag: that does.
+      shipped: returns the file of a name, or raises a ValueError.
+
     Raises:
-      UsageError: if no model of that name comes with the library.
+      UsageError: if nothing of that name comes with the library.
     """
     if source.exists() or source.parts[:1] != (PRETRAINED,):
         return source
     try:
-        return models.path("/".join(source.parts[1:]) or "epistemic")
+        return shipped("/".join(source.parts[1:]) or "epistemic")
     except ValueError as error:
-        raise UsageError(f"--from {source} is not valid; {error}") from error
+        raise UsageError(f"{flag} {source} is not valid; {error}") from error
 
 
 def read(path: Path, said: str) -> Model:

@@ -31,7 +31,11 @@ _SMOKE_PLANNER = PlannerConfig(
     precision="f32",
 )
 _NO_REFIT = TrainingConfig(0)
-_LAPTOP_DISTILL = DistillingConfig(num_trials=20, horizon=150, num_updates=2000)
+# A policy is imagined on a GPU; on two cores the planner teaches it.
+_NOT_IMAGINED = dataclasses.replace(DistillingConfig.critic, num_updates=0)
+_LAPTOP_DISTILL = DistillingConfig(
+    10, num_trials=20, horizon=150, num_updates=2000, critic=_NOT_IMAGINED
+)
 # The laptop plans about 20,000 and not 1,500,000 model steps an action with a network a
 # third as large, and trains longer on the little data there is, so that nothing is left
 # for a refit. Many short trials beat few long ones.
@@ -69,7 +73,9 @@ PRESETS = {
         tuning=TrainingConfig(1, 16),
         planner=_SMOKE_PLANNER,
         task_planner=_SMOKE_PLANNER,
-        distill=DistillingConfig(2, num_trials=6, horizon=4, num_updates=3),
+        distill=DistillingConfig(
+            2, num_trials=6, horizon=4, num_updates=3, critic=_NOT_IMAGINED
+        ),
     ),
 }
 

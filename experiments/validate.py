@@ -64,13 +64,12 @@ def _check_critic(config: Config) -> None:
     if not updates:
         alone = "False without --critic.num-updates"
         require(not config.critic.acts, "--critic.acts", True, alone)
-    if config.phase == "finetune":
-        valid = "0 in finetune"
+    if config.phase in ("finetune", "distill"):
+        valid = f"0 in {config.phase}; it is for zero-shot"
         require(not updates, "--critic.num-updates", updates, valid)
     if config.phase == "distill":
-        valid = "False in distill, where a policy acts in any case"
-        require(not config.critic.acts, "--critic.acts", True, valid)
-        rounds, valid = config.distill.num_rounds, "1 or more, or a critic imagines"
+        rounds, updates = config.distill.num_rounds, config.distill.critic.num_updates
+        valid = "1 or more without --distill.critic.num-updates"
         require(rounds + updates > 0, "--distill.num-rounds", rounds, valid)
     if updates:
         alone = "0 with a critic, which is asked about one member at a time"

@@ -1,4 +1,4 @@
-"""Policies and values of a task, learned from a model alone."""
+"""Policies and values of tasks, learned from a model alone; a policy comes along."""
 
 from jaxpets._src.actor_critic import actor_critic
 from jaxpets._src.actor_critic_records import (
@@ -18,6 +18,7 @@ from jaxpets._src.distill_records import (
 )
 from jaxpets._src.policy_file import load_policy, save_policy
 from jaxpets._src.policy_onnx import to_onnx
+from jaxpets._src.pretrained import policy_path as path
 from jaxpets._src.prior import prior
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "Guided",
     "actor_critic",
     "load_policy",
+    "path",
     "prior",
     "save_policy",
     "to_onnx",

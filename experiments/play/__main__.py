@@ -81,7 +81,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--seed", type=int, help="of a run with several; by default the first")
     add(
         "--policy", type=Path, metavar="FILE",
-        help="policy-SEED.safetensors of distill, which can act in place of the plans",
+        help="policy-SEED.safetensors of distill, or pretrained/NAME, which can act in "
+        "place of the plans; by default that which came with the model, if one did",
     )  # fmt: skip
     add(
         "--horizon", type=_steps, metavar="STEPS",

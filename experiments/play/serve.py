@@ -77,7 +77,8 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     robot, horizon = found.robot, options.horizon or found.search.horizon
     search = dataclasses.replace(found.search, horizon=horizon)
     rollout, _ = build.rollout_of(robot, found.size, search)
-    policy = source.policy_of(options.policy, robot) if options.policy else None
+    file = options.policy or found.policy
+    policy = source.policy_of(file, robot) if file else None
     live = Live(
         robot, rollout, build.optimizer(search, robot.env), found.params,
         horizon=horizon, terminal_fn=build.imagined_end(robot.env), policy=policy,

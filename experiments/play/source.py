@@ -1,5 +1,6 @@
 """What a page is about: a robot, a model of it, and the search that plans with it."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,6 +9,7 @@ import jax
 from jax import Array
 
 import jaxpets
+from jaxpets import policies
 from jaxpets.envs import Robot, with_constants
 from jaxpets.policies import Guided, load_policy
 
@@ -26,6 +28,7 @@ class Source(NamedTuple):
     params: jaxpets.EnsembleParams
     search: PlannerConfig
     title: str
+    policy: Path | None = None  # that came along with the model
 
 
 def found(source: str, *, env: str | None = None, seed: int | None = None) -> Source:
@@ -62,10 +65,15 @@ def robot_named(env: str) -> Robot:
 def policy_of(path: Path, robot: Robot) -> Policy:
     """Returns the policy in a file, for all tasks of a robot.
 
+    Args:
+      path: of the file, or `pretrained/NAME`.
+      robot: that acts by it.
+
     Raises:
       UsageError: if there is no such file.
       CheckpointError: if it is no policy, or one of another robot or of other tasks.
     """
+    path = model_file.named(path, "--policy", policies.path)
     goals = policy.family(robot, len(robot.tasks.names))
     try:
         planner, networks = load_policy(path, goals=goals, space=robot.space)
@@ -100,12 +108,18 @@ def _acts(found: Policy, robot: Robot) -> Callable[..., jaxpets.typing.PlanOutpu
 
 def _of_file(path: Path, said: str, env: str | None) -> Source:
     model = model_file.read(path, said)
-    robot = robot_named(model_file.robot_of(model, said, env))
+    name = model_file.robot_of(model, said, env)
+    robot = robot_named(name)
     model_file.check_fits(model, robot, said)
     config = model.ensemble.config
     assert config is not None
     search = model_file.search_of(model, said)
-    return Source(robot, config, model.params, search, said)
+    own = None
+    # A robot of the user's own may have other tasks than the model's.
+    if path != Path(said) and name == model.about.get("environment"):
+        with contextlib.suppress(UsageError):  # most models came without one
+            own = model_file.named(Path(said), "--policy", policies.path)
+    return Source(robot, config, model.params, search, said, own)
 
 
 def _of_run(run: Path, env: str | None, seed: int | None) -> Source:

@@ -1,4 +1,4 @@
-"""The models that come with the library."""
+"""The models and the policies that come with the library."""
 
 from pathlib import Path
 
@@ -8,12 +8,13 @@ from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.model_file import load_model
 
 _SHIPPED = Path(__file__).parents[1] / "models"
+_POLICIES = _SHIPPED / "policies"
 
 
 def names() -> tuple[str, ...]:
     """Returns the names of the models that come with the library."""
-    files = (file.relative_to(_SHIPPED) for file in _SHIPPED.rglob("*.safetensors"))
-    return tuple(sorted(file.with_suffix("").as_posix() for file in files))
+    apart = f"{_POLICIES.name}/"
+    return tuple(name for name in _below(_SHIPPED) if not name.startswith(apart))
 
 
 def path(name: str) -> Path:
@@ -22,10 +23,23 @@ def path(name: str) -> Path:
     Raises:
       ValueError: if there is no such model; the nearest names are said.
     """
-    if name not in names():
-        near = ", ".join(nearest(name, names()) or names())
-        raise ValueError(f"name must be a model, as {near}, got {name!r}.")
-    return _SHIPPED / f"{name}.safetensors"
+    return _named(name, "model", names(), _SHIPPED)
+
+
+def policy_path(name: str) -> Path:
+    """Returns the file of a policy that comes with the library.
+
+    It was learned in what the model of that name imagines, and performs without a
+    plan. `load_policy(path("best"), goals=Goals(features=jnp.stack))` reads it, to act
+    on `tasks.params` of the robot, which it sees.
+
+    Args:
+      name: "best", which performs all four tasks of HalfCheetah.
+
+    Raises:
+      ValueError: if there is no such policy; the nearest names are said.
+    """
+    return _named(name, "policy", _below(_POLICIES), _POLICIES)
 
 
 def pretrained(name: str) -> tuple[Ensemble, EnsembleParams]:
@@ -45,3 +59,16 @@ def pretrained(name: str) -> tuple[Ensemble, EnsembleParams]:
       ValueError: if there is no such model; the nearest names are said.
     """
     return load_model(path(name))
+
+
+def _below(folder: Path) -> tuple[str, ...]:
+    """Returns the names of the files in a folder and those below."""
+    files = (file.relative_to(folder) for file in folder.rglob("*.safetensors"))
+    return tuple(sorted(file.with_suffix("").as_posix() for file in files))
+
+
+def _named(name: str, kind: str, known: tuple[str, ...], folder: Path) -> Path:
+    if name not in known:
+        near = ", ".join(nearest(name, known) or known)
+        raise ValueError(f"name must be a {kind}, as {near}, got {name!r}.")
+    return folder / f"{name}.safetensors"

@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from experiments import cli, phases
-from experiments.config import Config
+from experiments.config import Config, DistillingConfig, ImaginationConfig
 from experiments.entries import to_json
 from experiments.errors import InterruptedRun, OutOfMemoryError
 from experiments.presets import PRESETS
@@ -256,13 +256,14 @@ def test_later_phases_are_not_started_on_a_cpu_for_hours(fail, out):
     assert "--phase zero-shot of --preset smoke would take about 3 hours" in line
     code, line = fail("distill", *LATER[2:], "--distill.horizon", "100000", *huge[:2])
     assert code == 2 and "--phase distill of --preset smoke would take" in line
-    critic = ("--critic.num-updates", "10000000", "--critic.batch-size", "65536")
-    for phase in ("zero-shot", "distill"):
-        code, line = fail(phase, *LATER[2:], *critic)
+    for phase, group in (("zero-shot", "--"), ("distill", "--distill.")):
+        critic = (f"{group}critic.num-updates", "10000000")
+        rows = (f"{group}critic.batch-size", "65536")
+        code, line = fail(phase, *LATER[2:], *critic, *rows)
         assert code == 2 and f"--phase {phase} of --preset smoke would take" in line
 
 
-_CRITIC = dataclasses.replace(PRESETS["smoke"].critic, num_updates=1)
+_IMAGINED = DistillingConfig(2, 6, critic=ImaginationConfig(1))
 
 
 @pytest.mark.parametrize(
@@ -281,9 +282,9 @@ _CRITIC = dataclasses.replace(PRESETS["smoke"].critic, num_updates=1)
             "--seeds, --eval-trials, --distill.num-trials, --task-planner.num-samples",
         ),
         (
-            dict(phase="distill", task="forward", critic=_CRITIC),
+            dict(phase="distill", task="forward", distill=_IMAGINED),
             "6 trials",
-            "--seeds, --eval-trials, --distill.num-trials, --critic.batch-size",
+            "--seeds, --eval-trials, --distill.num-trials, --distill.critic.batch-size",
         ),
     ],
 )
@@ -299,13 +300,14 @@ def test_out_of_memory_names_the_flags_of_the_phase(changes, planned, flags):
 def test_what_an_older_run_lacks_is_that_of_its_preset_and_arm(out, said):
     path = explored(out, name="mine", preset="paper", arm="best")
     data = json.loads(path.read_text())
-    del data["refit"]["bootstrap"], data["tuning"]
+    del data["refit"]["bootstrap"], data["tuning"], data["distill"]["critic"]
     path.write_text(json.dumps(data))
     flags = ("--phase", "finetune", "--from", str(path.parent), *said)
     config = cli.parse(flags)
     assert not config.refit.bootstrap
     assert config.refit.num_epochs == PRESETS["smoke"].refit.num_epochs  # as recorded
     assert config.tuning == PRESETS["paper"].tuning
+    assert config.distill.critic == PRESETS["paper"].distill.critic
 
 
 def test_laptop_is_the_default():
@@ -321,6 +323,14 @@ def test_the_paper_preset_has_the_numbers_of_the_paper():
     assert (paper.planner.horizon, paper.planner.num_particles) == (30, 20)
     assert paper.planner == paper.task_planner
     assert isinstance(paper, Config)
+
+
+def test_a_policy_is_imagined_at_the_size_of_the_paper_alone():
+    imagined = ImaginationConfig(60_000, batch_size=1024, horizon=10)
+    own = {name: config.distill for name, config in PRESETS.items()}
+    assert (own["paper"].num_rounds, own["paper"].critic) == (0, imagined)
+    assert (own["laptop"].num_rounds, own["laptop"].critic.num_updates) == (10, 0)
+    assert (own["smoke"].num_rounds, own["smoke"].critic.num_updates) == (2, 0)
 
 
 def test_best_is_the_paper_with_another_refit_and_search_for_tasks():

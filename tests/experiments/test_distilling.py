@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 import runs
 
+import jaxpets
 from experiments import distilling, policy, robots
 from experiments.run import main
 from experiments.storage import rundir
+from jaxpets import policies
 from jaxpets.policies import load_policy
 
 PHASE = ("--phase", "distill", "--task", "forward,front-flip")
@@ -67,7 +69,7 @@ def test_a_stopped_run_performs_with_what_it_had_learned(explored, capsys):
 
 @pytest.mark.slow
 def test_a_policy_can_be_imagined_before_a_planner_is_asked(explored, capsys):
-    flags = ("--critic.num-updates", "5", "--critic.batch-size", "6")
+    flags = ("--distill.critic.num-updates", "5", "--distill.critic.batch-size", "6")
     alone = ("--distill.num-rounds", "0", "--tag", "imagined")
     said = distilled(explored, capsys, *flags, *alone)
     assert "an imagined policy of all tasks: 5 gradient steps" in said
@@ -111,13 +113,39 @@ def test_a_task_is_seen_by_its_weights_or_as_one_of_several():
     assert set(np.unique(seen[:, :-2])) == {0.0, 1.0}
 
 
+def test_the_policy_that_comes_along_performs_all_tasks():
+    """At least half of what each of four trials of 200 steps returned."""
+    robot = robots.named(rundir.HALF_CHEETAH, "mujoco")
+    tasks = robot.tasks
+    goals = policy.family(robot, len(tasks.names))
+    planner, networks = load_policy(policies.path("best"), goals=goals)
+    keys = jax.random.split(jax.random.key(0))
+
+    def returned(task):
+        params = jaxpets.PlanParams((), policies.Guided(task, networks))
+        state = jaxpets.start_trial(robot.env, planner, keys[0])
+        _, seen, _ = jaxpets.unroll(
+            robot.env, planner, params, keys[1], state, length=200
+        )
+        return jax.vmap(tasks.reward_fn, (None, 0, 0, 0))(task, *seen).sum()
+
+    found = jax.jit(jax.vmap(returned))(tasks.params)
+    assert tasks.names == ("forward", "backward", "front-flip", "back-flip")
+    assert (np.asarray(found) > (450, 290, 870, 910)).all()
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--critic.num-updates", "5", "--critic.acts"), "--critic.acts True is not"),
+        (("--critic.num-updates", "5"), "it must be 0 in distill"),
+        (("--critic.acts",), "--critic.acts True is not"),
         (("--distill.num-rounds", "0"), "--distill.num-rounds 0 is not valid"),
+        (
+            ("--distill.critic.num-updates", "5", "--pessimism", "1"),
+            "--pessimism 1.0 is not valid",
+        ),
     ],
-    ids=["acts", "rounds"],
+    ids=["critic", "acts", "rounds", "pessimism"],
 )
 def test_what_cannot_be_is_refused(explored, capsys, flags, words):
     assert main([*PHASE, *flags, "--from", str(explored), "--tag", "refused"]) == 2

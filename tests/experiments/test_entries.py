@@ -151,8 +151,11 @@ def test_what_an_older_version_did_not_write_was_the_default():
     default = to_json(PRESETS["paper"])
     old = json.loads(json.dumps(default))
     del old["refit"]["bootstrap"], old["pessimism"], old["tuning"]
+    del old["distill"]["critic"]
     assert differences(old, default) == []
     new = {**default, "pessimism": 3.0}
+    new["distill"] = to_json(PRESETS["paper"].distill)
+    new["distill"]["critic"]["num_updates"] = 9
     new["refit"] = {**default["refit"], "bootstrap": False}
     new["tuning"] = {**default["tuning"], "num_epochs": 9}
     assert differences(old, new) == [

@@ -569,6 +569,8 @@ def visitor(monkeypatch):
 
 def test_a_page_does_what_visitors_ask(visitor):
     visitor.sees("It performs forward.")
+    visitor.sets("acts by", "policy")  # which came with the model
+    visitor.sees("by its policy, without a plan")
     visitor.sets("task", "backward")
     visitor.sees("-velocity - 0.1 * effort")
     visitor.sets("reward", "velocity + heigt")

@@ -1,4 +1,6 @@
-"""The page's switch between plans and a policy that was distilled from them."""
+"""The page's switch between plans and a policy, which may come with the model."""
+
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +9,11 @@ import optax
 import pytest
 
 import jaxpets
-from experiments import policy
+from experiments import policy, robots
 from experiments.errors import CheckpointError, UsageError
 from experiments.play.command import POLICY, TO_EXPLORE, Commands
 from experiments.play.readout import curves, disagreement, under_line
-from jaxpets import envs
+from jaxpets import envs, policies
 from jaxpets.policies import ActorCriticConfig, Goals, actor_critic, save_policy
 
 pytest.importorskip("viser", reason="the extra jaxpets[play] is not installed")
@@ -102,6 +104,25 @@ def test_a_policy_acts_on_tasks_and_plans_on_all_else(cheetah, live, found):
         assert len(planned.ghosts)
     controls.apply(session, first, [Press("acts", "x"), Press("acts", "plan")])
     assert not session.command.is_for_policy
+
+
+def test_a_model_that_came_along_brings_its_policy(cheetah, monkeypatch):
+    for name, own in (
+        ("pretrained/best", policies.path("best")),
+        ("pretrained", None),
+        ("pretrained/dmc/walker", None),
+        (str(jaxpets.models.path("best")), None),  # a file, of whomever
+    ):
+        assert source.found(name).policy == own
+    robot = cheetah[0]
+    monkeypatch.setattr(robots, "named", lambda *_: robot)
+    assert source.found("pretrained/best", env="own.py").policy is None
+    said = source.policy_of(Path("pretrained/best"), robot)
+    np.testing.assert_array_equal(
+        said.networks.mean, source.policy_of(policies.path("best"), robot).networks.mean
+    )
+    with pytest.raises(UsageError, match="--policy pretrained/bst is not valid; name"):
+        source.policy_of(Path("pretrained/bst"), robot)
 
 
 def test_a_file_that_is_no_policy_of_the_robot_is_refused(cheetah, tmp_path):

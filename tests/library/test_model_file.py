@@ -233,3 +233,5 @@ def test_what_comes_with_the_library_is_read():
         search(action_low=-high, action_high=high, **found["search"]["settings"])
     with pytest.raises(ValueError, match="name must be a model, as best, got 'bst'"):
         jaxpets.pretrained("bst")
+    with pytest.raises(ValueError, match="name must be a model, as"):
+        models.path("policies/best")

@@ -11,7 +11,7 @@ from safetensors.numpy import load_file, save_file
 from test_policy_onnx import BOX, SPACES, policy_of
 
 import jaxpets
-from jaxpets import PlanParams, policies
+from jaxpets import PlanParams, envs, policies
 
 GOALS = policies.Goals(features=lambda target: jnp.stack([target, -target]))
 SPACE, SIZE = SPACES["turning"]
@@ -96,3 +96,16 @@ def test_a_strangers_file_is_refused(saved, tmp_path, changes, words):
 def test_a_model_is_no_policy():
     with pytest.raises(ValueError, match="no format 'jaxpets policy'"):
         policies.load_policy(jaxpets.models.path("best"))
+
+
+def test_what_comes_with_the_library_is_read():
+    robot = envs.make("pets/half_cheetah", backend="mujoco")
+    goals = policies.Goals(features=jnp.stack)
+    planner, params = policies.load_policy(policies.path("best"), goals=goals)
+    task = jax.tree.map(lambda x: x[0], robot.tasks.params)
+    obs = robot.env.reset(jax.random.key(0)).obs
+    known = PlanParams((), policies.Guided(task, params))
+    plan, _ = planner.step(known, jax.random.key(0), (), obs)
+    assert plan.action.shape == (6,) and jnp.abs(plan.action).max() <= 1.0
+    with pytest.raises(ValueError, match="name must be a policy, as best, got 'bst'"):
+        policies.path("bst")
