@@ -166,6 +166,8 @@ def _explored(config: Config) -> Config:
     # What an older version did not write is that of the run's own preset, arm and
     # robot, not of those that happen to be said again.
     own = from_json(data, config, str(path))
+    if "critic" not in data.get("distill", {}):
+        data.pop("distill", None)  # another recipe, which no exploration depends on
     explored = from_json(data, preset_config(own.preset, own.arm, own.env), str(path))
     for entry in ("env", "arm"):
         said, found = getattr(config, entry), getattr(explored, entry)
@@ -185,5 +187,5 @@ def _check_file(config: Config) -> None:
         valid = "0; a file of a model has no data"
         epochs, updates = config.refit.num_epochs, config.critic.num_updates
         require(epochs == 0, "--refit.num-epochs", epochs, valid)
-        if config.phase != "distill":  # which imagines from what the planner does
+        if config.phase != "distill":  # which refuses it in any case
             require(updates == 0, "--critic.num-updates", updates, valid)

@@ -139,7 +139,7 @@ class ImaginationConfig:
     horizon: Annotated[int, Meta(ge=1, le=1000)] = ActorCriticConfig.horizon
     """Steps that are imagined in a gradient step."""
     discount: Annotated[float, Meta(ge=0.0, le=0.9999)] = 0.99
-    """Per step of the environment, also of zero-shot's plans."""
+    """Per step of the environment; a plan that ends with the critic has it too."""
     trace: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
     """lambda of the returns that the critic learns."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.5
@@ -179,6 +179,7 @@ class DistillingConfig:
     hidden_size: Annotated[int, Meta(ge=1, le=8192)] = DistillConfig.hidden_size
     """Width of the policy's two layers."""
     critic: ImaginationConfig = ImaginationConfig(60_000, batch_size=1024, horizon=10)
+    """How it is imagined."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -65,7 +65,8 @@ def _check_critic(config: Config) -> None:
         alone = "False without --critic.num-updates"
         require(not config.critic.acts, "--critic.acts", True, alone)
     if config.phase in ("finetune", "distill"):
-        valid = f"0 in {config.phase}; it is for zero-shot"
+        other = "; --distill.critic.num-updates is meant here"
+        valid = f"0 in {config.phase}{other * (config.phase == 'distill')}"
         require(not updates, "--critic.num-updates", updates, valid)
     if config.phase == "distill":
         rounds, updates = config.distill.num_rounds, config.distill.critic.num_updates

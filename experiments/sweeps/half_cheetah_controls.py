@@ -14,7 +14,10 @@ from jaxpets.envs import half_cheetah
 
 
 def without_pitch(model: jaxpets.Ensemble) -> tuple[Any, jaxpets.RewardData]:
-    """`epistemic`, but for the pitch, which has no weight."""
+    """`epistemic`, but for the pitch, which has no weight.
+
+    Its gradient is not finite there; a search asks for none.
+    """
     weights = jnp.ones((model.obs_size,), jnp.float32)
     no_pitch = weights.at[half_cheetah.PITCH].set(jnp.inf)
     data = jaxpets.RewardData(
