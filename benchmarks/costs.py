@@ -11,7 +11,7 @@ from jaxpets.envs import half_cheetah
 
 def candidates_per_action(size: workloads.Size, search: str) -> int:
     """Returns how many action sequences are rolled out for one action."""
-    if search == "cem":
+    if search != "icem":
         return size.num_samples * size.num_iterations
     counts = []  # iCEM's population shrinks; ask it, without running it
 

@@ -85,7 +85,7 @@ def build(config: Config) -> Parts:
     if guided:
         precision = jaxpets.Precision(config.task_planner.precision)
         model = _ensemble(robot, size, precision)
-        critic = make_critic(config, robot, model, terminal_fn)
+        critic = make_critic(config.critic, robot, model, terminal_fn)
 
     def with_policy(
         policy: jaxpets.Planner, reward_fn: jaxpets.typing.RewardFn

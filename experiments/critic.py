@@ -23,7 +23,7 @@ from jaxpets.policies import (
 
 from . import acting
 from .acting import at_start
-from .config import Config, part
+from .config import CriticConfig, part
 from .parallel import devices
 from .parallel.devices import Placement
 from .storage.folder import RunFolder
@@ -51,15 +51,16 @@ class Several(NamedTuple):
 
 
 def make_critic(
-    config: Config, robot: Robot, model: jaxpets.Ensemble, terminal_fn: TerminalFn,
+    settings: CriticConfig, robot: Robot, model: jaxpets.Ensemble,
+    terminal_fn: TerminalFn,
     goals: Goals | None = None,
 ) -> ActorCritic:  # fmt: skip
     """Returns the actor and the critic of a task, which imagine with this model.
 
     With goals they are of all tasks that these draw.
     """
-    settings, env = config.critic, robot.env
-    count, steps = calls(config)
+    env = robot.env
+    count, steps = calls(settings)
     rate = optax.cosine_decay_schedule(
         settings.learning_rate, count * steps, alpha=0.05
     )
@@ -87,14 +88,14 @@ def over(several: Several, function: Any, takes: tuple[Any, ...]) -> Any:
 
 
 def learned(
-    config: Config, critic: ActorCritic, several: Several, placement: Placement,
+    settings: CriticConfig, critic: ActorCritic, several: Several, placement: Placement,
     params: jaxpets.PlanParams, keys: Array, dataset: jaxpets.typing.Dataset,
     run: RunFolder,
 ) -> ActorCriticParams:  # fmt: skip
     """Returns the networks of critics that have learned, and tells the run.
 
     Args:
-      config: with the numbers of a critic.
+      settings: of a critic.
       critic: as `make_critic` returns it.
       several: of how many.
       placement: of them; params, keys and data are placed.
@@ -116,7 +117,7 @@ def learned(
     begin = time.monotonic()
     keys, now = acting.split_keys(keys)
     state = init(params, now, dataset)
-    count, updates = calls(config)
+    count, updates = calls(settings)
     skipped: Any = 0
     for _ in range(count):
         keys, now = acting.split_keys(keys)
@@ -126,7 +127,7 @@ def learned(
     value, skipped, networks = devices.collect(
         placement, (metrics.value, skipped, state.params), *several.axes
     )
-    earned = float(jnp.mean(value)) * (1 - config.critic.discount)
+    earned = float(jnp.mean(value)) * (1 - settings.discount)
     run.say(
         f"{several.name}: {count * updates:,} gradient steps; its actor expects "
         f"{earned:.3f} a step  {time.monotonic() - begin:.1f} s"
@@ -139,10 +140,10 @@ def learned(
     return networks
 
 
-def calls(config: Config) -> tuple[int, int]:
+def calls(settings: CriticConfig) -> tuple[int, int]:
     """Returns in how many calls a critic learns, and the gradient steps of each."""
-    count = -(-config.critic.num_updates // _STEPS)
-    return count, -(-config.critic.num_updates // count)
+    count = -(-settings.num_updates // _STEPS)
+    return count, -(-settings.num_updates // count)
 
 
 def goals_of(robot: Robot) -> Goals:

@@ -4,8 +4,6 @@ A search finds other actions each time that do as well, of which a network would
 the mean. An actor that climbs a critic settles for one of them.
 """
 
-import dataclasses
-
 from jax import Array
 from jax.sharding import PartitionSpec as P
 
@@ -51,14 +49,13 @@ def learned(
       run: that is told.
     """
     own = config.distill
-    numbers = CriticConfig(**vars(own.critic), hidden_size=own.hidden_size)
-    config = dataclasses.replace(config, critic=numbers)
+    settings = CriticConfig(**vars(own.critic), hidden_size=own.hidden_size)
     robot = parts.robot
     actor = critic.make_critic(
-        config, robot, parts.model, imagined_end(robot.env),
+        settings, robot, parts.model, imagined_end(robot.env),
         family(robot, len(tasks.names)),
     )  # fmt: skip
 
     return critic.learned(
-        config, actor, _POLICIES, placement, params, keys, dataset, run
+        settings, actor, _POLICIES, placement, params, keys, dataset, run
     )

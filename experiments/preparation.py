@@ -93,7 +93,7 @@ def _learned(
     )
     dataset = devices.place(placement, state.dataset, SEED)
     return critic.learned(
-        config, parts.critic, _CRITICS, placement, params, keys, dataset, run
+        config.critic, parts.critic, _CRITICS, placement, params, keys, dataset, run
     )
 
 

@@ -5,31 +5,21 @@ import re
 import tarfile
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
-import jaxpets
+from benchmarks import costs, workloads
 
 RESULTS = Path(__file__).parents[2] / "results"
 TASKS = ("forward", "backward", "front-flip", "back-flip")
 
 
 def steps_of_a_plan(search):
-    """What the code imagines: counted, not computed."""
-    one = np.ones(6, np.float32)
-    sizes = {x: search[x] for x in ("horizon", "num_samples", "num_iterations")}
-    if search["optimizer"] != "mppi":
-        sizes["num_elites"] = search["num_elites"]
-    build = getattr(jaxpets.optimizers, search["optimizer"])
-    optimizer = build(action_low=-one, action_high=one, keep_candidates=True, **sizes)
-
-    def search_once(key):
-        value = lambda key, actions: actions.sum((1, 2))  # noqa: E731
-        return optimizer.step(value, key, optimizer.init())[0].candidates.values
-
-    tried = jax.eval_shape(search_once, jax.random.key(0)).shape[0]
-    return tried * search["horizon"] * search["num_particles"]
+    """What the code imagines."""
+    names = ("horizon", "num_samples", "num_iterations", "num_elites", "num_particles")
+    size = workloads.Size(**{x: search[x] for x in names})
+    candidates = costs.candidates_per_action(size, search["optimizer"])
+    return candidates * size.horizon * size.num_particles
 
 
 @pytest.fixture(scope="module")
