@@ -187,5 +187,4 @@ def _check_file(config: Config) -> None:
         valid = "0; a file of a model has no data"
         epochs, updates = config.refit.num_epochs, config.critic.num_updates
         require(epochs == 0, "--refit.num-epochs", epochs, valid)
-        if config.phase != "distill":  # which refuses it in any case
-            require(updates == 0, "--critic.num-updates", updates, valid)
+        require(updates == 0, "--critic.num-updates", updates, valid)

@@ -31,6 +31,14 @@ T = TypeVar("T")
 # Makes an error of an entry's name, what it is and what it must be; None: not there.
 Refuse = Callable[[str, Any, str | None], Exception]
 
+# What phase 2 has from exploration as it was, and what its phases leave to each other.
+_PAST = ("random_trials", "training", "planner")
+_UNREAD = {
+    "zero-shot": (*_PAST, "finetune_trials", "tuning", "distill"),
+    "finetune": (*_PAST, "eval_trials", "critic", "distill"),
+    "distill": (*_PAST, "finetune_trials", "tuning", "critic"),
+}
+
 
 class Entry(NamedTuple):
     """A field that is not a group of fields."""
@@ -59,6 +67,11 @@ def entries(role: type, group: str = "") -> Iterator[Entry]:
         else:
             about = getattr(hint, "__metadata__", ())
             yield Entry(group + name, tuple(x for x in about if isinstance(x, Mark)))
+
+
+def is_read(name: str, phase: str) -> bool:
+    """Returns whether a phase reads an entry; explore keeps all for later ones."""
+    return name.partition(".")[0] not in _UNREAD.get(phase, ())
 
 
 def flag(name: str) -> str:
@@ -152,7 +165,7 @@ def from_json(data: Any, default: Config, where: str = "config.json") -> Config:
 def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
     """Returns where two configs in JSON are not of the same run: `entry: old vs new`.
 
-    Which trial completes it may change.
+    Which trial completes it may change, and what its phase does not read.
 
     An entry that `old` lacks, because an older version wrote it, was what is now the
     default. A group of entries that it lacks cannot differ. `where` is what an error
@@ -162,10 +175,14 @@ def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
       CheckpointError: if one of them cannot be read.
     """
     now, then = from_json(new, Config()), from_json(old, Config(), where)
+    # distill read it until it had its own.
+    once = () if _has_group(old, "distill.critic.") else ("critic.",)
     pairs = {
         entry.name: (entry.of(then), entry.of(now))
         for entry in entries(Run)
-        if Mark.GOAL not in entry.marks and _has_group(old, entry.name)
+        if Mark.GOAL not in entry.marks
+        and (is_read(entry.name, now.phase) or entry.name.startswith(once))
+        and _has_group(old, entry.name)
     }
     return [
         f"{name}: {to_json(pair[0])} (there) vs {to_json(pair[1])} (now)"

@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from .config import UNDIVIDED, Config, PlannerConfig
-from .entries import Mark, entries, flag
+from .entries import Mark, entries, flag, is_read
 from .errors import UsageError
 from .storage import rundir, trackers
 
@@ -64,10 +64,6 @@ def _check_critic(config: Config) -> None:
     if not updates:
         alone = "False without --critic.num-updates"
         require(not config.critic.acts, "--critic.acts", True, alone)
-    if config.phase in ("finetune", "distill"):
-        other = "; --distill.critic.num-updates is meant here"
-        valid = f"0 in {config.phase}{other * (config.phase == 'distill')}"
-        require(not updates, "--critic.num-updates", updates, valid)
     if config.phase == "distill":
         rounds, updates = config.distill.num_rounds, config.distill.critic.num_updates
         valid = "1 or more without --distill.critic.num-updates"
@@ -103,12 +99,19 @@ def check_names(config: Config) -> None:
 
 
 def check_explored(config: Config, explored: Config) -> None:
-    """Refuses to call a model what it is not."""
+    """Refuses to call a model what it is not, and what the phase would ignore."""
+    phase, names = config.phase, {entry.name for entry in entries(Config)}
     for entry in entries(Config):
-        if Mark.EXPLORED in entry.marks:
-            given, found = entry.of(config), entry.of(explored)
+        given, found = entry.of(config), entry.of(explored)
+        if not is_read(entry.name, phase):
+            valid = f"left out in {phase}, which does not read it"
+            if (own := f"{phase}.{entry.name}") in names:
+                valid = f"{valid}; {flag(own)} is meant here"
+        elif Mark.EXPLORED in entry.marks:
             valid = f"{found}, as in the exploration run"
-            require(given == found, flag(entry.name), given, valid)
+        else:
+            continue
+        require(given == found, flag(entry.name), given, valid)
 
 
 def check_process(config: Config) -> None:

@@ -231,6 +231,35 @@ def test_a_model_is_called_what_it_is(fail, out, flags, words):
 
 
 @pytest.mark.parametrize(
+    ("phase", "said", "meant"),
+    [
+        ("zero-shot", "--planner.horizon 9", ""),
+        ("zero-shot", "--distill.num-rounds 9", ""),
+        ("finetune", "--eval-trials 9", ""),
+        ("finetune", "--critic.num-updates 9", ""),
+        ("distill", "--tuning.batch-size 9", ""),
+        ("distill", "--critic.hidden-size 9", ""),
+        (
+            "distill",
+            "--critic.batch-size 9",
+            "; --distill.critic.batch-size is meant here",
+        ),
+    ],
+)
+def test_a_phase_refuses_what_it_would_ignore(fail, out, phase, said, meant):
+    explored(out)
+    code, line = fail(phase, *LATER[2:], *said.split())
+    left_out = f"it must be left out in {phase}, which does not read it{meant}."
+    assert code == 2 and line == f"error: {said} is not valid; {left_out}\n"
+
+
+def test_what_a_phase_ignores_may_be_said_as_it_is(out):
+    explored(out)
+    said = ("--planner.horizon", "3", "--distill.num-rounds", "2")
+    assert cli.parse([*LATER, "--out", str(out), *said]).planner.horizon == 3
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ('{"num_trails": 3}', "unknown entry 'num_trails'"),

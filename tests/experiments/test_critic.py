@@ -97,7 +97,7 @@ def test_what_is_drawn_for_a_trial_is_seen():
     [
         (
             ("--phase", "finetune", *FLAGS),
-            "--critic.num-updates 3 is not valid; it must be 0",
+            "--critic.num-updates 3 is not valid; it must be left out in finetune",
         ),
         (("--phase", "zero-shot", "--critic.acts"), "--critic.acts"),
         (("--phase", "zero-shot", *FLAGS, "--pessimism", "1"), "--pessimism 1.0"),

@@ -137,7 +137,7 @@ def test_the_policy_that_comes_along_performs_all_tasks():
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--critic.num-updates", "5"), "it must be 0 in distill"),
+        (("--critic.num-updates", "5"), "--distill.critic.num-updates is meant"),
         (("--critic.acts",), "--critic.acts True is not"),
         (("--distill.num-rounds", "0"), "--distill.num-rounds 0 is not valid"),
         (

@@ -164,6 +164,20 @@ def test_what_an_older_version_did_not_write_was_the_default():
     ]
 
 
+def test_what_a_phase_does_not_read_is_no_difference():
+    """Older versions took it and wrote it down, or had another default."""
+    old, new = to_json(PRESETS["smoke"]), to_json(PRESETS["smoke"])
+    old["phase"] = new["phase"] = "zero-shot"
+    old["planner"]["horizon"], old["distill"]["num_rounds"] = 9, 9
+    assert differences(old, new) == []
+    old["phase"] = new["phase"] = "distill"
+    assert differences(old, new) == ["distill.num_rounds: 9 (there) vs 2 (now)"]
+    old["distill"]["num_rounds"], old["critic"]["num_updates"] = 2, 9
+    assert differences(old, new) == []
+    del old["distill"]["critic"]  # then it was read
+    assert differences(old, new) == ["critic.num_updates: 9 (there) vs 0 (now)"]
+
+
 def test_a_run_of_a_newer_version_is_not_continued():
     """What this version does not know it cannot do as it was done."""
     config = to_json(Config())
