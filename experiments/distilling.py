@@ -118,7 +118,7 @@ def distill(
             _POLICY: _perform(now, _POLICY, state, turns, count),
             _BOTH: _perform(now, _BOTH, state, turns + 1, count),
         }
-    export(run, config, parts, state.reward)
+    export(run, config, parts, tasks, state.reward, source, step)
     rows = [
         row
         for i, who in enumerate(WHO)

@@ -17,7 +17,7 @@ from jaxpets import models
 
 from . import robots, user_files
 from .config import Config, ModelConfig, PlannerConfig
-from .entries import from_json
+from .entries import from_json, to_json
 from .errors import CheckpointError, UsageError
 from .presets import preset_config
 from .storage import rundir
@@ -105,6 +105,28 @@ def read(path: Path, said: str) -> Model:
         raise UsageError(f"--from {said} is not valid; {valid}.") from error
     except (TypeError, ValueError) as error:
         raise CheckpointError(str(error)) from error
+
+
+def training(run: "RunFolder", config: Config, seed: int, trial: int) -> dict[str, Any]:
+    """Returns how the model of a run came to be, as a file says it."""
+    refitted = config.phase != "explore" and config.refit.num_epochs
+    return {
+        "arm": rundir.label(config.arm),
+        "seed": seed,
+        "num_trials": trial,
+        "trial_length": config.trial_length,
+        "refit": to_json(config.refit) if refitted else None,
+        "software": run.find_json(rundir.ENVIRONMENT),
+    }
+
+
+def origin(source: Source) -> dict[str, Any]:
+    """Returns which model a phase starts from, and what only its file knows of it."""
+    if not isinstance(source, ModelFile):
+        return {"model": source.path.name}
+    shipped = {models.path(x).resolve(): f"{PRETRAINED}/{x}" for x in models.names()}
+    refit = _training(models.about(source.path)).get("refit")
+    return {"model": shipped.get(source.path, source.path.name), "refit": refit}
 
 
 def robot_of(model: Model, said: str, env: str | None) -> str:

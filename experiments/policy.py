@@ -21,9 +21,11 @@ from jaxpets.policies import (
     to_onnx,
 )
 
-from . import critic
+from . import critic, model_file, user_files
 from .build import Parts, imagined_end
 from .config import Config
+from .entries import to_json
+from .storage import rundir
 from .storage.folder import RunFolder
 
 
@@ -84,10 +86,27 @@ def family(robot: Robot, count: int) -> Goals:
 
 
 def export(
-    run: RunFolder, config: Config, parts: Parts, networks: ActorCriticParams
-) -> None:
-    """Writes the policies `[S]` for others, and for programs without JAX if it can."""
+    run: RunFolder, config: Config, parts: Parts, tasks: Tasks,
+    networks: ActorCriticParams, source: model_file.Source, step: int,
+) -> None:  # fmt: skip
+    """Writes the policies `[S]` for others, and for programs without JAX if it can.
+
+    Args:
+      run: that gets the files.
+      config: of distill.
+      parts: made with it.
+      tasks: that the policies were learned on.
+      networks: `[S]`.
+      source: what explored.
+      step: trials behind the model.
+    """
     env, space = parts.robot.env, parts.robot.space
+    own = user_files.is_file(config.env)
+    about = {
+        "environment": rundir.label(config.env) if own else config.env,
+        "tasks": tasks.names,
+    }
+    origin = {**model_file.origin(source), "distill": to_json(config.distill)}
     built: Any = {
         "obs_size": parts.model.obs_size,
         "action_low": env.action_low,
@@ -96,7 +115,11 @@ def export(
     for i, seed in enumerate(config.seeds):
         name = f"policy-{seed}"
         params = jax.tree.map(operator.itemgetter(i), networks)
-        save = functools.partial(save_policy, params=params, space=space, **built)
+        training = model_file.training(run, config, seed, step) | origin
+        save = functools.partial(
+            save_policy, params=params, space=space, **built,
+            about={**about, "training": training},
+        )  # fmt: skip
         run.export(f"{name}.safetensors", save)
         try:
             content = to_onnx(params, space, **built)

@@ -14,9 +14,8 @@ from typing import Any
 
 import jaxpets
 
-from .. import exploration
-from ..config import Config, PlannerConfig
-from ..entries import to_json
+from .. import exploration, model_file
+from ..config import PlannerConfig
 from ..errors import RunError, storage_errors
 from ..presets import quick_search
 from ..storage import disk, rundir
@@ -55,7 +54,9 @@ def share(
     about = {
         "environment": config.env if env is None else rundir.label(env),
         "licence": licence,
-        "training": _training(RunFolder(run), config, found.seed, found.trial),
+        "training": model_file.training(
+            RunFolder(run), config, found.seed, found.trial
+        ),
         "search": _search(search),
     } | ({"weights": "float16"} if half else {})
     model = _planned_with(found.parts.model, search)
@@ -72,20 +73,6 @@ def _planned_with(model: jaxpets.Ensemble, search: PlannerConfig) -> jaxpets.Ens
         obs_size=model.obs_size,
         action_size=model.action_size,
     )
-
-
-def _training(
-    folder: RunFolder, config: Config, seed: int, trial: int
-) -> dict[str, Any]:
-    refitted = config.phase == "zero-shot" and config.refit.num_epochs
-    return {
-        "arm": rundir.label(config.arm),
-        "seed": seed,
-        "num_trials": trial,
-        "trial_length": config.trial_length,
-        "refit": to_json(config.refit) if refitted else None,
-        "software": folder.find_json(rundir.ENVIRONMENT),
-    }
 
 
 def _search(planner: PlannerConfig) -> dict[str, Any]:

@@ -30,11 +30,11 @@ def metadata(kind: str, texts: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
-def check_format(file: tensor_file.TensorFile, kind: str) -> None:
-    """Refuses a file of another kind, or of a later version."""
-    wanted = f"jaxpets {kind}"
-    if file.metadata.get("format") != wanted:
-        refuse(file, f"its metadata has no format {wanted!r}")
+def check_format(file: tensor_file.TensorFile, *kinds: str) -> None:
+    """Refuses a file of none of these kinds, or of a later version."""
+    wanted = [f"jaxpets {kind}" for kind in kinds]
+    if file.metadata.get("format") not in wanted:
+        refuse(file, f"its metadata has no format {' or '.join(map(repr, wanted))}")
     version = file.metadata.get("version", "")
     if not (version.isascii() and version.isdigit() and len(version) < 10):
         refuse(file, f"its version must be a number, got {version!r}")

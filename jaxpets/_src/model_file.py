@@ -128,14 +128,14 @@ def load_model(
 
 
 def about(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Returns what `save_model` got as `about`.
+    """Returns what `save_model`, or `policies.save_policy`, got as `about`.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is no model of jaxpets.
+      ValueError: if it is no model or policy of jaxpets.
     """
     file = tensor_file.read(path)
-    file_facts.check_format(file, _KIND)
+    file_facts.check_format(file, _KIND, "policy")
     return file_facts.object_of(file, "about")
 
 

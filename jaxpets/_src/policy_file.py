@@ -41,7 +41,8 @@ def save_policy(
       obs_size: D, likewise.
       action_low: `[A]`, likewise.
       action_high: `[A]`.
-      about: anything else that JSON can hold.
+      about: anything else that JSON can hold, for `models.about`; by custom as of a
+        model, and "tasks".
 
     Raises:
       TypeError, ValueError: if an argument is not what it should be, or has NaN.

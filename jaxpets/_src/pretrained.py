@@ -31,7 +31,8 @@ def policy_path(name: str) -> Path:
 
     It was learned in what the model of that name imagines, and performs without a
     plan. `load_policy(path("best"), goals=Goals(features=jnp.stack))` reads it, to act
-    on `tasks.params` of the robot, which it sees.
+    on `tasks.params` of the robot, which it sees. How it came to be is in
+    `models.about(path("best"))`.
 
     Args:
       name: "best", which performs all four tasks of HalfCheetah.

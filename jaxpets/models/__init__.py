@@ -1,4 +1,4 @@
-"""Models that come along, what a file says about its model, and a model without noise.
+"""Models that come along, what a file says about itself, and a model without noise.
 
 `jaxpets.save_model`, `jaxpets.load_model` and `jaxpets.pretrained` write and read them.
 """

@@ -46,6 +46,13 @@ def test_a_policy_performs_beside_its_planner(explored, capsys):
     seen, acted = paths["obs"][:, :, 0, :-1], paths["action"][:, :, 0, 1:]
     assert np.ptp(acted[0] - acted[1]) > 1e-3  # seeds have networks of their own
     assert load_policy(folder / "policy-7.safetensors")
+    about = jaxpets.models.about(folder / "policy-7.safetensors")
+    assert about["environment"] == rundir.HALF_CHEETAH
+    assert about["tasks"] == ["forward", "front-flip"]
+    training = about["training"]
+    assert (training["model"], training["seed"]) == (explored.name, 7)
+    assert (training["num_trials"], training["refit"]["num_epochs"]) == (3, 1)
+    assert training["distill"]["num_rounds"] == 2 and training["software"]["jax"]
     onnxruntime = pytest.importorskip("onnxruntime")
     goal = [[1.0, 0.0, 0.1], [0.0, 1.0, 0.1]]
     for i, seed in enumerate((0, 7)):

@@ -11,7 +11,7 @@ import pytest
 import runs
 
 import jaxpets
-from experiments import cli, exploration
+from experiments import cli, exploration, model_file
 from experiments.build import build
 from experiments.config import Config
 from experiments.entries import to_json
@@ -117,7 +117,17 @@ def test_a_policy_is_distilled_from_a_file(file, tmp_path):
     flags = [x for name, n in distill.items() for x in (f"--distill.{name}", str(n))]
     command = ["distill", "--from", str(file), *SMALL, *flags, "--out", str(tmp_path)]
     assert main(command) == 0
-    assert (tmp_path / "mine/distill-003-front-flip/policy-0.safetensors").is_file()
+    policy = tmp_path / "mine/distill-003-front-flip/policy-0.safetensors"
+    training, own = (models.about(x)["training"] for x in (policy, file))
+    assert training["model"] == file.name
+    assert training["refit"] == own["refit"] and own["refit"]["num_epochs"] == 1
+
+
+def test_a_model_that_came_along_is_called_by_its_name():
+    path = models.path("best")
+    assert model_file.origin(model_file.ModelFile(path.resolve())) == {
+        "model": "pretrained/best", "refit": models.about(path)["training"]["refit"],
+    }  # fmt: skip
 
 
 def again(file, path, **changes):

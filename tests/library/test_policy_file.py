@@ -44,6 +44,17 @@ def test_what_was_saved_acts_the_same(policy, saved):
         np.testing.assert_array_equal(got, want)
 
 
+def test_a_policy_needs_nothing_to_be_said_about_it(saved, tmp_path):
+    path = tmp_path / "p"
+    assert jaxpets.models.about(saved) == {"a": 1}
+    with safe_open(saved, "np") as file:
+        texts = {k: v for k, v in file.metadata().items() if k != "about"}
+    save_file(load_file(saved), path, texts)
+    assert policies.load_policy(path, goals=GOALS)
+    with pytest.raises(ValueError, match="its metadata lacks 'about'"):
+        jaxpets.models.about(path)
+
+
 def test_own_functions_are_not_saved(policy, tmp_path):
     planner, params, obs = policy
     own = SPACE._replace(coordinates=())
@@ -107,5 +118,13 @@ def test_what_comes_with_the_library_is_read():
     known = PlanParams((), policies.Guided(task, params))
     plan, _ = planner.step(known, jax.random.key(0), (), obs)
     assert plan.action.shape == (6,) and jnp.abs(plan.action).max() <= 1.0
+    found = jaxpets.models.about(policies.path("best"))
+    assert (found["environment"], tuple(found["tasks"])) == (
+        robot.name, robot.tasks.names,
+    )  # fmt: skip
+    own = jaxpets.models.about(jaxpets.models.path("best"))["training"]
+    same = ("arm", "seed", "num_trials", "trial_length", "refit")
+    assert {x: found["training"][x] for x in same} == {x: own[x] for x in same}
+    assert found["training"]["model"] == "pretrained/best"
     with pytest.raises(ValueError, match="name must be a policy, as best, got 'bst'"):
         policies.path("bst")
