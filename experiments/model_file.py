@@ -68,6 +68,7 @@ def named(
     source: Path,
     flag: str = "--from",
     shipped: Callable[[str], Path] = models.path,
+    plain: str = "epistemic",
 ) -> Path:
     """Returns the path of a file or folder, which may be called `pretrained/NAME`.
 
@@ -75,6 +76,7 @@ def named(
       source: as the command line names it.
       flag: that does.
       shipped: returns the file of a name, or raises a ValueError.
+      plain: the name that `pretrained` alone stands for.
 
     Raises:
       UsageError: if nothing of that name comes with the library.
@@ -82,7 +84,7 @@ def named(
     if source.exists() or source.parts[:1] != (PRETRAINED,):
         return source
     try:
-        return shipped("/".join(source.parts[1:]) or "epistemic")
+        return shipped("/".join(source.parts[1:]) or plain)
     except ValueError as error:
         raise UsageError(f"{flag} {source} is not valid; {error}") from error
 

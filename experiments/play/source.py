@@ -73,7 +73,7 @@ def policy_of(path: Path, robot: Robot) -> Policy:
       UsageError: if there is no such file.
       CheckpointError: if it is no policy, or one of another robot or of other tasks.
     """
-    path = model_file.named(path, "--policy", policies.path)
+    path = model_file.named(path, "--policy", policies.path, plain="best")
     goals = policy.family(robot, len(robot.tasks.names))
     try:
         planner, networks = load_policy(path, goals=goals, space=robot.space)

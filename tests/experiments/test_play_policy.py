@@ -117,10 +117,10 @@ def test_a_model_that_came_along_brings_its_policy(cheetah, monkeypatch):
     robot = cheetah[0]
     monkeypatch.setattr(robots, "named", lambda *_: robot)
     assert source.found("pretrained/best", env="own.py").policy is None
-    said = source.policy_of(Path("pretrained/best"), robot)
-    np.testing.assert_array_equal(
-        said.networks.mean, source.policy_of(policies.path("best"), robot).networks.mean
-    )
+    own = source.policy_of(policies.path("best"), robot)
+    for said in ("pretrained/best", "pretrained"):  # there is no other
+        found = source.policy_of(Path(said), robot)
+        np.testing.assert_array_equal(found.networks.mean, own.networks.mean)
     with pytest.raises(UsageError, match="--policy pretrained/bst is not valid; name"):
         source.policy_of(Path("pretrained/bst"), robot)
 
