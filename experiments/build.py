@@ -46,13 +46,13 @@ class Parts(NamedTuple):
     # The same with a policy, whose actions a search begins with; data are Guided.
     with_policy: Callable[[jaxpets.Planner, jaxpets.typing.RewardFn], jaxpets.Planner]
     critic: ActorCritic | None  # what guides zero-shot
-    learner: jaxpets.Learner  # phase 1
+    learner: jaxpets.typing.Learner  # phase 1
     reward_data: jaxpets.RewardData  # of its reward
     bind: Bind  # what gives them the constants of a trial
     explored_by: str  # what imagines in phase 1, as env.json has it
     performed_by: str  # and in phase 2
     refitter: jaxpets.typing.Fitter | None  # between the phases
-    finetuner: jaxpets.Learner  # phase 2
+    finetuner: jaxpets.typing.Learner  # phase 2
 
 
 def build(config: Config) -> Parts:
@@ -102,7 +102,7 @@ def build(config: Config) -> Parts:
 
     def learner(
         fit: TrainingConfig, data: jaxpets.RewardData, length: int, capacity: int
-    ) -> jaxpets.Learner:
+    ) -> jaxpets.typing.Learner:
         fitter = _fitter(trained, fit)
         return jaxpets.learner(
             env, trained, fitter, data, trial_length=length, capacity=capacity

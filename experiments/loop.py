@@ -126,7 +126,9 @@ def run(
     return True
 
 
-def over_branches(placement: Placement, learner: jaxpets.Learner, *axes: str) -> Learn:
+def over_branches(
+    placement: Placement, learner: jaxpets.typing.Learner, *axes: str
+) -> Learn:
     """Returns `learn` over `axes`, jitted, with its share of them on every device."""
     for axis in reversed(axes):
         learner = jaxpets.over_seeds(learner, devices.each(placement, axis))

@@ -32,9 +32,11 @@ from jaxpets._src.distill import distill
 from jaxpets._src.ensemble import Ensemble, delta_space, ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig
 from jaxpets._src.ensemble_params import EnsembleParams
-from jaxpets._src.fitter import FitConfig, fitter
+from jaxpets._src.fit_records import FitConfig
+from jaxpets._src.fitter import fitter
+from jaxpets._src.fused_fitter import fused_fitter
 from jaxpets._src.fused_rollout import fused_rollout
-from jaxpets._src.learner import Learner, RewardData, learner
+from jaxpets._src.learner import RewardData, learner
 from jaxpets._src.model_file import load_model, save_model
 from jaxpets._src.network import Precision
 from jaxpets._src.over_seeds import SEED_AXES, over_seeds
@@ -63,7 +65,6 @@ __all__ = [
     "Env",
     "EnvState",
     "FitConfig",
-    "Learner",
     "ModelSpace",
     "PlanParams",
     "Planner",
@@ -77,6 +78,7 @@ __all__ = [
     "distill",
     "ensemble",
     "fitter",
+    "fused_fitter",
     "fused_rollout",
     "learner",
     "load_model",

@@ -3,7 +3,7 @@
 from jaxpets._src.agent import Agent
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams, NetworkParams, Scaler
-from jaxpets._src.fitter import FitMetrics, FitState, Fitter
+from jaxpets._src.fit_records import FitMetrics, FitState, Fitter
 from jaxpets._src.fused_rollout import FusedRollout
 from jaxpets._src.learner import Learner, LearnerState, RewardData, TrialOutput
 from jaxpets._src.types import (

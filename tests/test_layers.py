@@ -39,6 +39,8 @@ LAYERS = {
     "_src.kernel.wgmma_layout": 2,
     "_src.kernel.mma_layout": 2,
     "_src.kernel.cpu_layout": 1,
+    "_src.kernel.device": 1,
+    "_src.kernel.fit_layout": 2,
     "_src.plan": 2,
     "_src.cem": 2,
     "_src.icem": 2,
@@ -69,7 +71,10 @@ LAYERS = {
     "_src.ensemble_config": 2,
     "_src.ensemble_params": 3,
     "_src.ensemble": 4,
+    "_src.optimizer": 1,
+    "_src.fit_records": 4,
     "_src.fitter": 5,
+    "_src.fused_fitter": 6,
     "_src.formula": 1,
     "_src.formula_program": 2,
     "_src.formula_text": 3,
@@ -134,7 +139,7 @@ MODULES_OF_NAMES = [
 # Where third parties may be imported; jax anywhere.
 HOMES = {
     "flax": {"_src.network"},
-    "optax": {"_src.fitter"},
+    "optax": {"_src.fitter", "_src.optimizer"},
     "mujoco": {
         "envs.dmc_model",
         "envs.engines",

@@ -23,7 +23,6 @@ from jaxpets._src.checks import (
     check_count,
     check_record,
 )
-from jaxpets._src.fitter import Optimizer, check_optimizer
 from jaxpets._src.imagined_trials import (
     check_imagined,
     imagine,
@@ -32,6 +31,7 @@ from jaxpets._src.imagined_trials import (
     reward_range,
     trial_starts,
 )
+from jaxpets._src.optimizer import Optimizer, check_optimizer
 from jaxpets._src.types import (
     Dataset,
     DynamicsFn,

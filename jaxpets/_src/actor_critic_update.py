@@ -14,9 +14,9 @@ from jaxpets._src.actor_critic_records import (
     ActorCriticParams,
     ActorCriticState,
 )
-from jaxpets._src.fitter import Optimizer
 from jaxpets._src.guards import guarded_step
 from jaxpets._src.imagined_trials import Imagined
+from jaxpets._src.optimizer import Optimizer
 
 # Keeps the actor's outputs where its tanh has a slope.
 _ACTION_DECAY = 1e-4

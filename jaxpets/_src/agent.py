@@ -17,7 +17,7 @@ from jaxpets._src.agent_world import World, autoreset_of
 from jaxpets._src.checks import check_count, check_record
 from jaxpets._src.ensemble import Ensemble, params_check
 from jaxpets._src.ensemble_params import EnsembleParams
-from jaxpets._src.fitter import FitMetrics, Fitter
+from jaxpets._src.fit_records import FitMetrics, Fitter
 from jaxpets._src.learner import LearnerState, RewardData
 from jaxpets._src.types import Planner, PlanParams
 

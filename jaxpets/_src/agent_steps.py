@@ -13,7 +13,7 @@ from jaxpets._src import dataset as datasets
 from jaxpets._src.checks import check_array
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams
-from jaxpets._src.fitter import FitMetrics, Fitter
+from jaxpets._src.fit_records import FitMetrics, Fitter
 from jaxpets._src.learner import LearnerState, RewardData, fitted, new_state
 from jaxpets._src.types import Planner, PlanParams, Transition
 

@@ -22,13 +22,13 @@ from jaxpets._src.distill_records import (
 )
 from jaxpets._src.distill_trials import build_trials
 from jaxpets._src.distill_update import build_update
-from jaxpets._src.fitter import Optimizer, check_optimizer
 from jaxpets._src.imagined_trials import (
     check_imagined,
     imagine,
     over_trials,
     reward_range,
 )
+from jaxpets._src.optimizer import Optimizer, check_optimizer
 from jaxpets._src.types import (
     Dataset,
     DynamicsFn,

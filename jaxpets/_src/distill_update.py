@@ -10,8 +10,8 @@ from jax import Array
 from jaxpets._src.actor_critic_networks import Networks
 from jaxpets._src.actor_critic_records import ActorCriticParams
 from jaxpets._src.distill_records import DistillState, Plans
-from jaxpets._src.fitter import Optimizer
 from jaxpets._src.guards import guarded_step
+from jaxpets._src.optimizer import Optimizer
 
 
 def keep(state: DistillState, plans: Plans) -> DistillState:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_key, check_record
-from jaxpets._src.fitter import Optimizer, check_optimizer
 from jaxpets._src.moments import moments
+from jaxpets._src.optimizer import Optimizer, check_optimizer
 from jaxpets._src.types import Dataset, RewardFn
 
 Layers = tuple[tuple[Array, Array], ...]  # kernels and biases

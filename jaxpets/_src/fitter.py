@@ -1,6 +1,5 @@
 """Training of the ensemble: bootstraps, epochs and minibatches in one program."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
@@ -11,108 +10,47 @@ import optax
 from jax import Array
 
 from jaxpets._src.batches import Batch, minibatch, rows_shown, shuffle
-from jaxpets._src.checks import (
-    check_count,
-    check_flag,
-    check_key,
-    check_like,
-    check_real,
-    check_record,
-)
+from jaxpets._src.checks import check_key, check_like, check_record
 from jaxpets._src.ensemble import Ensemble, params_check
 from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.fit_records import FitConfig, FitMetrics, FitState, Fitter
 from jaxpets._src.guards import choose, is_finite
+from jaxpets._src.optimizer import Optimizer, check_optimizer
 from jaxpets._src.types import Dataset
 
 # Updates between two looks at how many there are: a GPU's host waits for each.
 _UPDATES_AT_ONCE = 4
-Optimizer = optax.GradientTransformation
 
 
-@dataclasses.dataclass(frozen=True)
-class FitConfig:
-    """How often and in what portions the data are shown; the defaults are PETS's.
-
-    Attributes:
-      num_epochs: passes over the data per call.
-      batch_size: rows per member and gradient step.
-      final_rate: the step size at the end of a call as a share of the optimizer's; it
-        falls along a cosine and starts anew with every call (SGDR, Loshchilov and
-        Hutter, 2017). 1 is PETS's constant rate, whose last steps leave noise in the
-        weights that looks like disagreement.
-      bootstrap: whether a member sees its own draw of rows, which leaves out a third
-        of them, or every row, and differs by its first weights and order alone (deep
-        ensembles, Lakshminarayanan et al., 2017).
-    """
-
-    num_epochs: int = 5
-    batch_size: int = 32
-    final_rate: float = 1.0
-    bootstrap: bool = True
-
-    def __post_init__(self) -> None:
-        check_count("num_epochs", self.num_epochs)
-        check_count("batch_size", self.batch_size)
-        check_real("final_rate", self.final_rate, 0.0, 1.0)
-        check_flag("bootstrap", self.bootstrap)
-
-
-class FitState(NamedTuple):
-    """The warm start of training.
-
-    Attributes:
-      opt_state: what the optimizer keeps between calls.
-    """
-
-    opt_state: Any
-
-
-class FitMetrics(NamedTuple):
-    """How the last call went.
-
-    Means leave out dropped updates; without any update that counts they are NaN.
-
-    Attributes:
-      nll: `[]`, mean over the last epoch of the negative log-likelihood that the
-        ensemble minimises, without the penalties of its loss.
-      mse: `[]`, mean squared error of the predicted mean, over members and dimensions,
-        in units of the targets squared.
-      num_updates: `[]` int32.
-      num_skipped: `[]` int32, updates dropped because they were not finite.
-    """
+class Totals(NamedTuple):
+    """Sums over the rows of an epoch's good updates, `[]`."""
 
     nll: Array
     mse: Array
-    num_updates: Array
-    num_skipped: Array
+    num_rows: Array
 
 
-class Fitter(NamedTuple):
-    """Training as a pure function.
+class Progress(NamedTuple):
+    """What an epoch changes."""
 
-    Attributes:
-      init: `(EnsembleParams) -> FitState`.
-      step: `(params, key, state, dataset) -> (params, state, FitMetrics)`.
-    """
-
-    init: Callable[[EnsembleParams], FitState]
-    step: Callable[
-        [EnsembleParams, Array, FitState, Dataset],
-        tuple[EnsembleParams, FitState, FitMetrics],
-    ]
-
-
-class _Totals(NamedTuple):
-    nll: Array  # [] sum over rows
-    mse: Array  # [] sum over rows
-    num_rows: Array  # [] rows
-
-
-class _Progress(NamedTuple):
     network: Any
     opt_state: Any
     num_skipped: Array  # [] int32
-    totals: _Totals  # of this epoch
+    totals: Totals  # of this epoch
+
+
+class Epoch(NamedTuple):
+    """What an epoch shows."""
+
+    data: tuple[Array, Array]  # inputs [C, F + A], targets [C, D]
+    rows: Array  # [E, C] int32, of which `size` count, in this epoch's order
+    size: Array  # [] int32
+    number: Array  # [] float32, of the epoch
+    num_batches: Array  # [] int32
+
+
+# `(progress, epoch) -> progress` after all of its updates.
+EpochFn = Callable[[Progress, Epoch], Progress]
 
 
 def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitter:
@@ -144,16 +82,9 @@ def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitte
     Raises:
       TypeError, ValueError: if an argument is not what it should be.
     """
-    check_record("ensemble", ensemble, Ensemble)
-    check_record("config", config, FitConfig)
-    check_optimizer(optimizer)
-    check_params = params_check(ensemble.init)
+    check_arguments(ensemble, optimizer, config)
 
-    def init(params: EnsembleParams) -> FitState:
-        check_params(params)
-        return FitState(optimizer.init(params.network))
-
-    def update(progress: _Progress, batch: Batch, done: Array) -> _Progress:
+    def update(progress: Progress, batch: Batch, done: Array) -> Progress:
         network, opt_state, num_skipped, totals = progress
         grad_fn = jax.value_and_grad(ensemble.loss, has_aux=True)
         # The whole loss is not asked for: the value of its penalties, which only their
@@ -173,14 +104,44 @@ def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitte
         network, opt_state = choose(
             good, (new_network, new_opt_state), (network, opt_state)
         )
-        mean = _Totals(nll, mse, jnp.ones_like(nll))
+        mean = Totals(nll, mse, jnp.ones_like(nll))
 
         def add(total: Array, x: Array) -> Array:
             return total + jnp.where(good, batch.num_rows * x, 0.0)
 
         totals = jax.tree.map(add, totals, mean)
         num_skipped += (has_rows & jnp.logical_not(finite)).astype(jnp.int32)
-        return _Progress(network, opt_state, num_skipped, totals)
+        return Progress(network, opt_state, num_skipped, totals)
+
+    def updates(progress: Progress, epoch: Epoch) -> Progress:
+        data, rows, size, number, num_batches = epoch
+
+        def one(i: Array, progress: Progress) -> Progress:
+            batch = minibatch(data, rows, i, config.batch_size, size)
+            done = number + i / jnp.maximum(num_batches, 1)
+            return update(progress, batch, done / config.num_epochs)
+
+        return _loop(num_batches, one, progress)
+
+    return of_epochs(ensemble, optimizer, config, updates)
+
+
+def check_arguments(ensemble: Any, optimizer: Any, config: Any) -> None:
+    """Raises unless the arguments of a fitter are what they should be."""
+    check_record("ensemble", ensemble, Ensemble)
+    check_record("config", config, FitConfig)
+    check_optimizer(optimizer)
+
+
+def of_epochs(
+    ensemble: Ensemble, optimizer: Optimizer, config: FitConfig, updates: EpochFn
+) -> Fitter:
+    """Builds a fitter from what an epoch does."""
+    check_params = params_check(ensemble.init)
+
+    def init(params: EnsembleParams) -> FitState:
+        check_params(params)
+        return FitState(optimizer.init(params.network))
 
     def step(
         params: EnsembleParams, key: Array, state: FitState, dataset: Dataset
@@ -199,20 +160,14 @@ def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitte
         num_batches = (size + config.batch_size - 1) // config.batch_size
 
         def epoch(
-            progress: _Progress, number_and_key: tuple[Array, Array]
-        ) -> tuple[_Progress, None]:
+            progress: Progress, number_and_key: tuple[Array, Array]
+        ) -> tuple[Progress, None]:
             number, key = number_and_key
-            shuffled = shuffle(key, rows, size)
-
-            def one(i: Array, progress: _Progress) -> _Progress:
-                batch = minibatch(data, shuffled, i, config.batch_size, size)
-                done = number + i / jnp.maximum(num_batches, 1)
-                return update(progress, batch, done / config.num_epochs)
-
+            shown = Epoch(data, shuffle(key, rows, size), size, number, num_batches)
             progress = progress._replace(totals=_zeros())
-            return _kept(progress, _loop(num_batches, one, progress), num_batches), None
+            return _kept(progress, updates(progress, shown), num_batches), None
 
-        start = _Progress(
+        start = Progress(
             params.network, state.opt_state, jnp.zeros((), jnp.int32), _zeros()
         )
         numbers = jnp.arange(config.num_epochs, dtype=jnp.float32)
@@ -229,32 +184,22 @@ def fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) -> Fitte
     return Fitter(init, step)
 
 
-def check_optimizer(optimizer: Any) -> None:
-    """Raises unless `optimizer` is one of optax."""
-    if not isinstance(optimizer, optax.GradientTransformation):
-        kind = type(optimizer).__name__
-        raise TypeError(
-            f"optimizer must be of optax, as optax.adam(1e-3), got {optimizer!r} "
-            f"({kind})."
-        )
-
-
 def _loop(
-    length: Array, body: Callable[[Array, _Progress], _Progress], progress: _Progress
-) -> _Progress:
+    length: Array, body: Callable[[Array, Progress], Progress], progress: Progress
+) -> Progress:
     """Runs `body` at least `length` times, in turns of a length that is known."""
 
-    def turn(i: Array, progress: _Progress) -> _Progress:
-        def one(j: Array, progress: _Progress) -> _Progress:
+    def turn(i: Array, progress: Progress) -> Progress:
+        def one(j: Array, progress: Progress) -> Progress:
             return body(i * _UPDATES_AT_ONCE + j, progress)
 
-        return cast(_Progress, jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, progress))
+        return cast(Progress, jax.lax.fori_loop(0, _UPDATES_AT_ONCE, one, progress))
 
     num_turns = (length + _UPDATES_AT_ONCE - 1) // _UPDATES_AT_ONCE
-    return cast(_Progress, jax.lax.fori_loop(0, num_turns, turn, progress))
+    return cast(Progress, jax.lax.fori_loop(0, num_turns, turn, progress))
 
 
-def _kept(before: _Progress, after: _Progress, num_batches: Array) -> _Progress:
+def _kept(before: Progress, after: Progress, num_batches: Array) -> Progress:
     """Returns an epoch's end, or its start if that is where the last good weights are.
 
     To look at all weights after every update would cost a fifth of a step on a GPU.
@@ -264,8 +209,8 @@ def _kept(before: _Progress, after: _Progress, num_batches: Array) -> _Progress:
     return choose(finite, after, refused)
 
 
-def _zeros() -> _Totals:
-    return _Totals(*(jnp.zeros((), jnp.float32),) * 3)
+def _zeros() -> Totals:
+    return Totals(*(jnp.zeros((), jnp.float32),) * 3)
 
 
 def _all_finite(*trees: Any) -> Array:

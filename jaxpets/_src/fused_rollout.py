@@ -18,6 +18,7 @@ from jaxpets._src.ensemble_config import EnsembleConfig
 from jaxpets._src.ensemble_params import EnsembleParams, imagined_range
 from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
 from jaxpets._src.kernel.cpu_layout import CpuLayout
+from jaxpets._src.kernel.device import HOPPER, capability, is_hopper
 from jaxpets._src.kernel.gpu_layout import GpuLayout
 from jaxpets._src.kernel.jaxpr_to_cpp import UnsupportedError, cpp_function
 from jaxpets._src.kernel.mma_layout import MmaLayout
@@ -26,8 +27,6 @@ from jaxpets._src.network import ACTIVATIONS, Precision
 from jaxpets._src.rollout import particle_rollout
 from jaxpets._src.types import ModelSpace
 
-# Hopper's instructions for a warpgroup are in this variant alone.
-_HOPPER = "sm_90a"
 _LAYOUTS = {"wgmma": WgmmaLayout, "mma": MmaLayout, "cpu": CpuLayout}
 
 
@@ -113,7 +112,7 @@ def fused_rollout(
             raise ValueError(
                 f"arch must be the name of a GPU, as sm_90a, got {arch!r}."
             )
-        kind = Kind.WGMMA if arch == _HOPPER else Kind.MMA
+        kind = Kind.WGMMA if arch == HOPPER else Kind.MMA
     rollout = rollout_of_kind(model, num_particles, kind, arch)
     if not rollout.uses_kernel and kind is Kind.WGMMA and arch is None:
         larger = rollout_of_kind(model, num_particles, Kind.MMA)
@@ -250,7 +249,7 @@ def _check_result(
 def _kind_for(device: Any) -> Kind:
     if device.platform == "cpu":
         return Kind.CPU
-    return Kind.WGMMA if _capability(device) == (9, 0) else Kind.MMA
+    return Kind.WGMMA if is_hopper(device) else Kind.MMA
 
 
 def _arch(device: Any, kind: Kind) -> str:
@@ -261,18 +260,13 @@ def _arch(device: Any, kind: Kind) -> str:
     """
     if device.platform != "gpu":
         raise UnsupportedError(f"the device is a {device.platform}, not a GPU or CPU")
-    major, minor = _capability(device)
+    major, minor = capability(device)
     if major < 8:
         seen = getattr(device, "compute_capability", "unknown")
         raise UnsupportedError(
             f"the GPU's compute capability is {seen}, not 8.0 or more"
         )
-    return _HOPPER if kind is Kind.WGMMA else f"sm_{major}{minor}"
-
-
-def _capability(device: Any) -> tuple[int, int]:
-    seen = re.fullmatch(r"(\d+)\.(\d)", getattr(device, "compute_capability", ""))
-    return (int(seen[1]), int(seen[2])) if seen else (0, 0)
+    return HOPPER if kind is Kind.WGMMA else f"sm_{major}{minor}"
 
 
 def _is_counted(key: Array) -> bool:

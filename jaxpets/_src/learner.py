@@ -12,7 +12,7 @@ from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import check_count, check_key, check_like, check_record
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_params import EnsembleParams
-from jaxpets._src.fitter import FitMetrics, FitState, Fitter
+from jaxpets._src.fit_records import FitMetrics, FitState, Fitter
 from jaxpets._src.types import (
     Dataset,
     Env,

@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxpets._src import dataset as datasets
 from jaxpets._src.checks import check_count, check_keys, check_record
-from jaxpets._src.fitter import FitMetrics
+from jaxpets._src.fit_records import FitMetrics
 from jaxpets._src.learner import Learner, LearnerState, TrialOutput
 from jaxpets._src.types import Planner, Transition
 

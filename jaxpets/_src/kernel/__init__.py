@@ -1,15 +1,19 @@
-"""The rollout of an ensemble as one compiled kernel: a map of this folder.
+"""Rollout and training of an ensemble as compiled kernels: a map of this folder.
 
 `jaxpets.fused_rollout` puts the parts together. Three kernels compute the same rollout:
 one for Hopper GPUs (wgmma_*), one for all GPUs from Ampere on (mma_*), both in float16,
 and one for CPUs in float32 (cpu_*). Those for GPUs have a reference in plain C++, for
 tests on machines without one.
 
+`jaxpets.fused_fitter` has a kernel of its own, fit_*, for Hopper GPUs: an epoch of
+training. Its reference is the same source, run by fibers on a CPU.
+
 The code. What depends on the model is generated into model.h, all else is fixed:
 
     ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function, primitives
     sizes -> constants                       {wgmma,mma,cpu}_layout: header
     widths -> tensor core instructions       wgmma_layout.products
+    sizes -> constants of training           fit_layout: header
     model.h and sources -> .so -> FFI target    build.load_kernel
     .so -> the next process                     cache.library
 
@@ -17,6 +21,7 @@ The numbers. Parameters are packed once per plan, and handed over at every call:
 
     parameters -> weights, as the kernel reads them    {gpu,cpu}_layout: pack
     weights, shared numbers, keys, obs, actions -> path    the FFI call
+    parameters and Adam's moments -> the same, an epoch later    fit_layout: pack, unpack
 
 Who includes whom:
 
@@ -24,11 +29,18 @@ Who includes whom:
     mma_rollout.cu      gpu_layout.h, gpu_launch.h, gpu_particles.h, mma_product.h
     wgmma_warp.h        gpu_particles.h: particles whose activations are in registers
     mma_product.h       gpu_layout.h: what a warp multiplies, and how its weights come
-    gpu_launch.h        handler.h: how XLA's call becomes a launch
+    gpu_launch.h        xla_call.h: how XLA's call becomes a launch
     gpu_particles.h     handler.h: what a warp or a block does with its particles
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
-    handler.h           rollout.h and XLA's c_api.h: the operands as XLA hands them over
+    fit_epoch.cu        fit_epoch.h, gpu_launch.h
+    fit_reference.cc    fit_epoch.h
+    fit_epoch.h         fit_forward.h, fit_backward.h, fit_state.h: an epoch, and its parts
+    these three         fit_block.h: what a block works with
+    fit_block.h         fit_operands.h, which includes fit_sizes.h and xla_call.h
+    fit_sizes.h         fit_device.h: Hopper's instructions, or fit_emulator.h: a CPU's
+    handler.h           rollout.h and xla_call.h: the operands as XLA hands them over
+    xla_call.h          XLA's c_api.h: what XLA calls
     rollout.h           sizes.h: the operands, and how far apart their numbers lie
     *_layout.h          sizes.h: where each weight lies, and their type
     sizes.h             model.h, and that particle.h: functions of one particle

@@ -20,7 +20,6 @@ import jax
 
 from jaxpets._src.kernel import cache
 
-_SYMBOL = "jaxpets_rollout"
 # Seconds until a compiler is ended. A kernel takes three, and ten on a GPU.
 _LIMIT, _GPU_LIMIT = 120.0, 300.0
 
@@ -33,6 +32,8 @@ class Kind(enum.Enum):
     WGMMA_REFERENCE = "gpu_reference.cc", "wgmma"  # a GPU's arithmetic, on a CPU
     MMA_REFERENCE = "gpu_reference.cc", "mma"
     CPU = "cpu_rollout.cc", "cpu"
+    FIT = "fit_epoch.cu", "fit"  # training, for Hopper
+    FIT_REFERENCE = "fit_reference.cc", "fit"  # the same source, on a CPU
 
     @property
     def source(self) -> str:
@@ -43,6 +44,11 @@ class Kind(enum.Enum):
     def layout(self) -> str:
         """Which of the layouts it reads."""
         return self.value[1]
+
+    @property
+    def symbol(self) -> str:
+        """What XLA calls."""
+        return "jaxpets_fit" if self.layout == "fit" else "jaxpets_rollout"
 
     @property
     def is_for_gpu(self) -> bool:
@@ -63,7 +69,7 @@ class Kernel(NamedTuple):
 
 @functools.cache
 def load_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
-    """Compiles the rollout for a model and registers it with XLA.
+    """Compiles a kernel for a model and registers it with XLA.
 
     The library is kept for the next process, see `cache`.
 
@@ -85,11 +91,11 @@ def load_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
         recipe.append(_processor(compiler))
     sources = {**_shipped_sources(), "model.h": model}
     digest = hashlib.sha256("\0".join([*recipe, *sources.values()]).encode())
-    target = f"{_SYMBOL}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
+    target = f"{kind.symbol}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
     make = functools.partial(_compile, compiler, sources, kind)
     try:
         with cache.library(target, make) as library:
-            handler = _loaded(library)
+            handler = _loaded(library, kind)
     except OSError as error:
         raise BuildError(f"there is no folder to build it in: {error}") from error
     where = "CUDA" if kind.is_for_gpu else "cpu"
@@ -121,12 +127,18 @@ def _compile(
     return library
 
 
-def _loaded(library: Path) -> Any:
+def _loaded(library: Path, kind: Kind) -> Any:
     """Returns the kernel of a library as a function of C."""
     try:
-        return getattr(ctypes.CDLL(str(library)), _SYMBOL)
+        loaded = ctypes.CDLL(str(library))
+        kernel = getattr(loaded, kind.symbol)
     except (OSError, AttributeError) as error:
         raise BuildError(f"cannot load the compiled kernel: {error}") from error
+    if kind is Kind.FIT:
+        loaded.jaxpets_problem.restype = ctypes.c_char_p
+        if problem := loaded.jaxpets_problem():
+            raise BuildError(problem.decode())
+    return kernel
 
 
 def _run(command: list[str], limit: float) -> str:

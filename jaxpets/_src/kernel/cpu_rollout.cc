@@ -265,5 +265,5 @@ XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {
 }  // namespace
 
 extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
-  return handle(*call, 0, run);
+  return handle<Rollout>(*call, 0, read, run);
 }

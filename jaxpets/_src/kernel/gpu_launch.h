@@ -1,7 +1,7 @@
 // How a kernel of a GPU is launched for XLA.
 #pragma once
 
-#include "handler.h"
+#include "xla_call.h"
 
 namespace {
 

@@ -92,5 +92,5 @@ XLA_FFI_Error* run(const Call&, const Rollout& whole) {
 }  // namespace
 
 extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
-  return handle(*call, 0, run);
+  return handle<Rollout>(*call, 0, read, run);
 }

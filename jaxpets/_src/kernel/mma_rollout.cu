@@ -241,5 +241,5 @@ XLA_FFI_Error* run(const Call& call, const Rollout& rollout) {
 }  // namespace
 
 extern "C" XLA_FFI_Error* jaxpets_rollout(XLA_FFI_CallFrame* call) {
-  return handle(*call, XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE, run);
+  return handle<Rollout>(*call, XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE, read, run);
 }
