@@ -1,5 +1,7 @@
 """Statistics over seeds: against scipy, by hand, and by how often intervals hold."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy import stats as scipy_stats
@@ -65,6 +67,11 @@ def test_difference_by_hand_and_how_often_it_holds():
     assert (high - low) / 2 == pytest.approx(half)
     assert stats.difference(ours, theirs[:1]) == (3.0, None)
     assert stats.difference(np.ones(2), np.zeros(3)) == (1.0, (1.0, 1.0))
+    with warnings.catch_warnings():  # of one arm without a spread there are none
+        warnings.simplefilter("error")
+        alike = stats.difference(np.ones(3), theirs).ci95
+    # As if the mean of one arm were known.
+    assert alike == pytest.approx(np.subtract(1.0, stats.t_interval(theirs))[::-1])
     rng = np.random.default_rng(4)
     held = [
         low <= 100.0 <= high
