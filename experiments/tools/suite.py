@@ -2,7 +2,8 @@
 
 Reads the zero-shot logs of `dmc/...` robots, or the file of results that was made of
 them, and prints a table in Markdown: means over seeds with 95 % intervals, means of the
-tasks, and what others have published.
+tasks, and what others have published. If an arm lacks tasks, a row has the means of
+those that every arm has.
 """
 
 import argparse
@@ -84,6 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--peers", type=Path, default=PEERS, help="others' numbers")
     parser.add_argument("--json", type=Path, help="file for the results")
     parser.add_argument("--figure", type=Path, help="file for them as a figure")
+    words = "also by how much the others return more than this one"
+    parser.add_argument("--than", metavar="ARM", help=words)
     args = parser.parse_args(argv)
     try:
         if args.runs.is_file():
@@ -91,6 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             found = results(args.runs, args.explored, args.tag)
         peers = read_peers(args.peers)
+        if args.than is not None and args.than not in found:
+            raise UsageError(f"--than {args.than}: it is none of {', '.join(found)}.")
         if args.json is not None:
             with storage_errors(f"write {args.json}"):
                 rundir.write_json(args.json, found)
@@ -102,7 +107,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
-    print("\n".join(table(found, peers)))
+    lines = table(found, peers)
+    if args.than is not None:
+        lines += ["", *differences(found, args.than)]
+    print("\n".join(lines))
     return 0
 
 
@@ -141,7 +149,10 @@ def table(found: Results, peers: Peers) -> list[str]:
         + [f"{peers.returns[x.name][name][i]:.0f}" for x, i in columns]
         for name in NAMES
     ]
-    for group, names in {"**mean**": NAMES, **_HALVES}.items():
+    groups = {"**mean**": NAMES, **_HALVES}
+    if 0 < len(common := _common(found)) < len(NAMES):
+        groups[f"the {len(common)} tasks that every arm has"] = common
+    for group, names in groups.items():
         theirs = [
             f"{statistics.mean(peers.returns[x.name][name][i] for name in names):.0f}"
             for x, i in columns
@@ -154,6 +165,29 @@ def table(found: Results, peers: Peers) -> list[str]:
     ]
     said = [_label(x, i) for x, i in columns]
     return [*tables.table(["task", *(f"`{x}`" for x in arms), *said], lines), *about]
+
+
+def differences(found: Results, than: str) -> list[str]:
+    """Returns returns of `than`, and how much more others have: tasks that all have."""
+    others = [arm for arm in tables.in_order(found) if arm != than]
+    common = _common(found)
+    groups = {f"**mean** (of {len(common)})": common} if common else {}
+    for group, names in _HALVES.items():
+        if both := tuple(x for x in names if x in common):
+            groups[f"{group} (of {len(both)})"] = both
+    rows = {name: (cell(found[than][name]), (name,)) for name in common}
+    rows |= {x: (_mean(found[than], names), names) for x, names in groups.items()}
+    lines = [
+        [label, own, *(_less(found[arm], found[than], names) for arm in others)]
+        for label, (own, names) in rows.items()
+    ]
+    header = ["task", f"`{than}`", *(f"`{arm}` less `{than}`" for arm in others)]
+    return tables.table(header, lines)
+
+
+def _common(found: Results) -> tuple[str, ...]:
+    """Returns the tasks that every arm has."""
+    return tuple(x for x in NAMES if all(x in own for own in found.values()))
 
 
 def _labels(peers: Peers) -> dict[tuple[str, int], str]:
@@ -232,15 +266,29 @@ def _mean(found: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
     own = [found[name] for name in names if name in found]
     if not own:
         return "-"
-    seeds = {frozenset(x["seeds"]) for x in own}
-    of_seeds = [
-        statistics.mean(x["seeds"][seed] for x in own)
-        for seed in sorted(seeds.pop() if len(seeds) == 1 else ())
-    ]
     mean = statistics.mean(x["mean"] for x in own)
-    interval = stats.t_interval(np.array(of_seeds))
+    interval = stats.t_interval(_of_seeds(own))
     text = cell({"mean": mean, "interval": interval})
     return text if len(own) == len(names) else f"{text} (of {len(own)})"
+
+
+def _less(
+    ours: Mapping[str, Mapping[str, Any]], theirs: Mapping[str, Mapping[str, Any]],
+    names: Sequence[str],
+) -> str:  # fmt: skip
+    """Returns the difference of two arms in a seed's mean of tasks, with Welch's."""
+    one, other = (_of_seeds([x[name] for name in names]) for x in (ours, theirs))
+    if not (len(one) and len(other)):
+        return "-"
+    found = stats.difference(one, other)
+    return cell({"mean": found.mean, "interval": found.ci95})
+
+
+def _of_seeds(own: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """Returns each seed's mean of tasks, `[S]`; of none if tasks have other seeds."""
+    seeds = {frozenset(x["seeds"]) for x in own}
+    same = sorted(seeds.pop()) if len(seeds) == 1 else []
+    return np.array([statistics.mean(x["seeds"][y] for x in own) for y in same], float)
 
 
 if __name__ == "__main__":

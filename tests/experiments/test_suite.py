@@ -67,10 +67,42 @@ def test_results_are_of_the_tasks_that_others_have(runs, tmp_path, peers, capsys
     assert "| walker/run | - | 10 | 31 |" in text
     # Of a seed's mean, 300 and 500: the interval is over seeds, not over tasks.
     assert "| **mean** | 400 [-871, 1671] (of 2) | 10 | 31 |" in text
+    assert "| the 2 tasks that every arm has | 400 [-871, 1671] | 10 | 31 |" in text
     # One of the two is of a domain that settings were chosen on.
     assert "| domains that settings were chosen on | 600 [-671, 1871] (of 1) |" in text
     assert "| the other domains | 200 [-1071, 1471] (of 1) | 10 | 31 |" in text
     assert "- Rival (with the reward): their page. It counts otherwise." in text
+
+
+def test_arms_are_compared_on_the_tasks_that_all_have(tmp_path, peers, capsys):
+    def arm(**by_task):
+        return {
+            name.replace("_", "/"): suite.numbers(dict(enumerate(seeds)), 4000)
+            for name, seeds in by_task.items()
+        }
+
+    path = tmp_path / "results.json"
+    found = {
+        "best": arm(cheetah_run=[500, 700], finger_spin=[300, 300], hopper_hop=[9, 9]),
+        "random": arm(cheetah_run=[100, 100, 100], finger_spin=[0, 150, 300]),
+        "opax": arm(cheetah_run=[300], finger_spin=[0, 100], walker_run=[9]),
+    }
+    path.write_text(json.dumps(found))
+    flags = [str(path), "--peers", peers]
+    assert suite.main([*flags, "--than", "random"]) == 0
+    text = capsys.readouterr().out
+    # Of hop, which one arm has, nothing is in these means.
+    assert "| the 2 tasks that every arm has | 125 [-61, 311] | 450 [-185," in text
+    _, text = text.split("| task | `random` | `best` less `random` | `opax` less ")
+    assert "| cheetah/run | 100 [100, 100] | 500 [-771, 1771] | 200 |" in text
+    assert "hopper/hop" not in text and "walker/run" not in text
+    # Seeds' means are 400 and 500 for best, and 50, 125 and 200 for random: an error
+    # of 66 and 2.4 degrees of freedom. Of opax they are unknown: its tasks have other
+    # seeds.
+    assert "| **mean** (of 2) | 125 [-61, 311] | 325 [81, 569] | - |" in text
+    assert "| the other domains (of 1) | 150 [-223, 523] | 150 [-223, 523] |" in text
+    assert suite.main([*flags, "--than", "oracle"]) == 2
+    assert "oracle: it is none of best, random, opax" in capsys.readouterr().err
 
 
 def test_a_variant_is_asked_for(runs, tmp_path, peers, capsys):
