@@ -65,7 +65,7 @@ def draw(
                    **look)
             for name, i, look in shown
         ]  # fmt: skip
-        for handles, where in ((ours, "upper left"), (theirs, "upper right")):
+        for handles, where in ((ours, "upper left"), (theirs, "lower right")):
             columns = len(handles)
             figure.legend(handles=handles, loc=f"outside {where}", ncols=columns)
         style.save(figure, target)
