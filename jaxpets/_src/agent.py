@@ -11,7 +11,6 @@ from jax import Array
 from jaxpets._src import agent_file
 from jaxpets._src import agent_steps as computed
 from jaxpets._src import agent_world as told
-from jaxpets._src.agent_file import Counts
 from jaxpets._src.agent_steps import ActFn, AgentSteps, act_fn, agent_steps
 from jaxpets._src.agent_world import World, autoreset_of
 from jaxpets._src.checks import check_count, check_record
@@ -122,7 +121,8 @@ class Agent:
         self._learn: computed.LearnFn = jax.jit(steps.learn)
         init_key, self._act_key, self._learn_key = jax.random.split(key, 3)
         self._state: LearnerState = jax.jit(steps.init)(init_key, params)
-        self._counts = Counts(0, 0, 0, trained=int(params is not None))
+        self._places = computed.places(self.params)
+        self._counts = agent_file.Counts(0, 0, 0, trained=int(params is not None))
         self._task: tuple[Planner, Any] | None = None
         self._acting: Planner | None = None  # whose state is `_plan`
         self._plan: Any = ()
@@ -185,7 +185,7 @@ class Agent:
         if planner is not self._acting:
             self._is_new = np.ones(self._world.lead, bool)
             self._acting = planner
-            self._plan = computed.first_state(planner, self._world.lead)
+            self._plan = computed.first_state(planner, self._world.lead, self._places)
         output, self._plan = self._compiled(planner)(
             self._act_key,
             np.int32(self._counts.acts),
@@ -289,7 +289,7 @@ class Agent:
     def _compiled(self, planner: Planner) -> ActFn:
         if planner not in self._acts:
             step = act_fn(planner, self._steps.action_size, self._world.num_envs)
-            self._acts[planner] = jax.jit(step)
+            self._acts[planner] = jax.jit(step, out_shardings=self._places)
         return self._acts[planner]
 
     def _remember(self) -> None:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxpets._src import dataset as datasets
 from jaxpets._src.checks import check_array
@@ -20,6 +21,9 @@ from jaxpets._src.types import Planner, PlanParams, Transition
 # `(key, number, is_new, PlanParams, state, obs) -> (action, state)`.
 ActFn = Callable[[Array, Any, Any, PlanParams, Any, Any], tuple[Array, Any]]
 LearnFn = Callable[[Array, LearnerState], tuple[LearnerState, FitMetrics]]
+# Of an action and of a planner's state; None leaves it to JAX.
+Places = tuple[Sharding | None, Sharding | None]
+_APART = ("gpu",)  # platforms whose memory is not the host's
 
 
 class AgentSteps(NamedTuple):
@@ -83,13 +87,37 @@ def act_fn(planner: Planner, action_size: int, num_envs: int | None) -> ActFn:
     return act
 
 
-def first_state(planner: Planner, lead: tuple[int, ...]) -> Any:
-    """Returns a planner's state with the leading axes of its worlds."""
+def places(params: EnsembleParams) -> Places:
+    """Returns where an action and a planner's state go.
+
+    The host waits for an action. A GPU that writes it to pinned memory of the host
+    spares it the copy: see "A plan that is waited for" in benchmarks/README.md.
+
+    Args:
+      params: of the model; it is computed where they are. On a CPU there is nothing to
+        gain, and what is on several devices has no one place: JAX decides.
+    """
+    devices = {x for leaf in jax.tree.leaves(params) for x in leaf.devices()}
+    if len(devices) != 1:
+        return None, None
+    (device,) = devices
+    kinds = {memory.kind for memory in device.addressable_memories()}
+    if device.platform not in _APART or "pinned_host" not in kinds:
+        return None, None
+    here = SingleDeviceSharding(device)
+    return here.with_memory_kind("pinned_host"), here
+
+
+def first_state(planner: Planner, lead: tuple[int, ...], places: Places) -> Any:
+    """Returns a planner's state with the leading axes of its worlds, in its place.
+
+    A step returns it there; if it began elsewhere, the second step would compile anew.
+    """
 
     def every(leaf: Any) -> Array:
         return jnp.broadcast_to(leaf, (*lead, *jnp.shape(leaf)))
 
-    return jax.tree.map(every, planner.init())
+    return jax.device_put(jax.tree.map(every, planner.init()), places[1])
 
 
 def strongly_typed(tree: Any) -> Any:
