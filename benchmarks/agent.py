@@ -1,8 +1,10 @@
 """What `jaxpets.agent` adds to a plan: `act` and the plan alone, awaited, in turn.
 
-The plan alone is one compiled call whose action comes to the host. `act` checks and
-copies the observation besides, and keeps what it did for `observe`. `added_ms` is the
-median of the differences, pair by pair.
+The plan alone is one compiled call whose action comes to the host, through `memory`: on
+a GPU the program writes it to the host's pinned memory, as `act` has it. `act` checks
+and copies the observation besides, and keeps what it did for `observe`. `added_ms` is
+the median of the differences, pair by pair. `copied_ms` is that of the plan alone whose
+action is copied from the device, which is how rows without `memory` have `plan_ms`.
 
 With `--policy` it is a step of a distilled policy instead, which needs no plan: by
 onnxruntime on one thread, and by JAX, one after the other.
@@ -17,14 +19,15 @@ from typing import Any
 import jax
 import numpy as np
 import optax
+from jax.sharding import SingleDeviceSharding
 
 import jaxpets
 from benchmarks import rows, timing, workloads
 from jaxpets import policies
 from jaxpets.envs import half_cheetah
 
-COLUMNS = ("added_ms", "act_ms", "act_p99_ms", "plan_ms", "plan_p99_ms", "size",
-           "engine")  # fmt: skip
+COLUMNS = ("added_ms", "act_ms", "act_p99_ms", "plan_ms", "plan_p99_ms", "copied_ms",
+           "copied_p99_ms", "memory", "size", "engine")  # fmt: skip
 OF_POLICY = ("onnx_us", "onnx_min_us", "onnx_p99_us", "jax_us", "jax_min_us",
              "jax_p99_us", "hidden_size")  # fmt: skip
 Call = Callable[[], np.ndarray]
@@ -36,8 +39,8 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     planner = workloads.planner(
         size, args.precision, args.optimizer, engine=args.engine
     )
-    pairs = timing.in_turn(*calls(size, planner), repeats=args.repeats)
-    acts, plans = 1e3 * np.asarray(pairs).T
+    turns = timing.in_turn(*calls(size, planner), repeats=args.repeats)
+    acts, plans, copied = 1e3 * np.asarray(turns).T
     yield rows.make_row(
         "agent",
         {
@@ -49,17 +52,29 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         },
         arch=workloads.arch(size, args.precision, args.engine),
         awaited=True,
+        memory=memory(),
         added_ms=float(np.median(acts - plans)),
         act_ms=float(np.median(acts)),
         act_p99_ms=float(np.percentile(acts, 99)),
         plan_ms=float(np.median(plans)),
         plan_p99_ms=float(np.percentile(plans, 99)),
+        copied_ms=float(np.median(copied)),
+        copied_p99_ms=float(np.percentile(copied, 99)),
         repeats=args.repeats,
     )
 
 
-def calls(size: workloads.Size, planner: jaxpets.Planner) -> tuple[Call, Call]:
-    """Returns `act` of an agent, and its plan alone."""
+def memory() -> str:
+    """Returns the kind of memory through which `act` gets its action."""
+    device = jax.devices()[0]
+    kinds = {one.kind for one in device.addressable_memories()}
+    if device.platform == "gpu" and "pinned_host" in kinds:
+        return "pinned_host"
+    return device.default_memory().kind
+
+
+def calls(size: workloads.Size, planner: jaxpets.Planner) -> tuple[Call, Call, Call]:
+    """Returns `act` of an agent, its plan alone, and that with a copied action."""
     key = jax.random.key(0)
     params = jax.jit(lambda: workloads.plan_params(size, key, "epistemic"))()
     one = np.ones(half_cheetah.ACTION_SIZE, np.float32)
@@ -73,10 +88,18 @@ def calls(size: workloads.Size, planner: jaxpets.Planner) -> tuple[Call, Call]:
     )
     agent.perform(params.reward)
     obs = np.asarray(workloads.transitions(key, 1).obs[0])
-    step, state = jax.jit(planner.step), planner.init()
+    here, copied = SingleDeviceSharding(jax.devices()[0]), jax.jit(planner.step)
+    state = jax.device_put(planner.init(), here)
+
+    def act(*given: Any) -> tuple[jax.Array, Any]:
+        output, state = planner.step(*given)
+        return output.action, state
+
+    step = jax.jit(act, out_shardings=(here.with_memory_kind(memory()), here))
     return (
         lambda: agent.act(obs),
-        lambda: np.asarray(step(params, key, state, obs)[0].action),
+        lambda: np.asarray(step(params, key, state, obs)[0]),
+        lambda: np.asarray(copied(params, key, state, obs)[0].action),
     )
 
 

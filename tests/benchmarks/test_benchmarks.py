@@ -160,7 +160,22 @@ def test_agent(tmp_path):
     assert json.loads(path.read_text()) == json.loads(json.dumps(row))
     assert 0 < row["plan_ms"] <= row["plan_p99_ms"]
     assert 0 < row["act_ms"] <= row["act_p99_ms"]
+    assert 0 < row["copied_ms"] <= row["copied_p99_ms"]
     assert abs(row["added_ms"]) < row["act_p99_ms"]
+
+
+def test_agent_says_through_which_memory_an_action_came(monkeypatch):
+    device = jax.devices()[0]
+    size = workloads.named_size("tiny")
+    planner = workloads.planner(size, "f32")
+    kinds = {memory.kind for memory in device.addressable_memories()}
+    ways = {device.default_memory().kind, "pinned_host"} & kinds
+    if device.platform == "cpu":  # which has nothing to copy
+        assert agent.memory() == device.default_memory().kind
+    for kind in ways:
+        monkeypatch.setattr(agent, "memory", lambda kind=kind: kind)
+        _, plan_alone, copied = agent.calls(size, planner)
+        np.testing.assert_array_equal(plan_alone(), copied())
 
 
 def test_agent_with_a_policy(tmp_path):
