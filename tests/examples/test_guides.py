@@ -8,6 +8,7 @@ import re
 import shlex
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pages
@@ -25,6 +26,7 @@ OWN = {
     "own_model": 2,
     "own_objective": 1,
     "own_robot": 3,
+    "own_world": 1,
     "scale": 1,
 }
 
@@ -43,6 +45,21 @@ def test_the_models_of_a_guide_plan():
     names = pages.execute("docs/own_model.md")
     assert names["plan"].action.shape == (1,)
     assert names["plan"].value < 0.0
+
+
+def test_an_own_loop_awaits_its_action_in_pinned_memory():
+    device = jax.devices()[0]
+    if "pinned_host" not in {memory.kind for memory in device.addressable_memories()}:
+        pytest.skip("this device has no such memory")
+    one, obs = jnp.ones(1), jnp.zeros(2)
+    planner = jaxpets.random_planner(-one, one, noise_beta=1.0)
+    names = pages.execute("docs/own_world.md", {"jax": jax, "planner": planner})
+    step, state, key = names["step"], names["state"], jax.random.key(0)
+    for _ in range(2):
+        action, state = step(None, key, state, obs)
+    assert action.sharding.memory_kind == "pinned_host" and action.shape == (1,)
+    assert jax.tree.leaves(state)[0].sharding == names["here"]
+    assert step._cache_size() == 1
 
 
 @pytest.mark.slow
