@@ -23,6 +23,7 @@ SET = (
     (plan, "--engine scan kernel sm_90 --seeds 1 4 16 --plans 10"),
     (plan, "--engine scan kernel --seeds 1 --num-samples 125 250 1000 2000 4000 8000"),
     (trace, "--seeds 1 4 16"),
+    (fit, "--engine kernel --seeds 1 4 16"),
 )
 
 

@@ -4,6 +4,7 @@ What is timed is a call of `Fitter.step`: scaler, bootstraps, shuffles and all u
 """
 
 import argparse
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -11,18 +12,18 @@ import jax
 
 from benchmarks import rows, timing, workloads
 
-COLUMNS = ("seeds", "rows", "capacity", "updates", "compile_s", "min_ms", "median_ms",
-           "us_per_update")  # fmt: skip
+COLUMNS = ("engine", "seeds", "rows", "capacity", "updates", "compile_s", "min_ms",
+           "median_ms", "us_per_update")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yields a row for every number of seeds."""
+    """Yields a row for every engine and number of seeds."""
     size = workloads.named_size("tiny" if args.tiny else "paper")
     num_rows = 100 if args.tiny else args.rows
     capacity = max(num_rows, args.capacity or 0)
-    fitter = workloads.fitter(size, args.epochs, args.batch_size)
     updates = args.epochs * -(-num_rows // args.batch_size)
-    for seeds in args.seeds:
+    for engine, seeds in itertools.product(args.engine, args.seeds):
+        fitter = workloads.fitter(size, args.epochs, args.batch_size, engine)
         keys = jax.random.split(jax.random.key(0), seeds)
         params, state, data = workloads.prepare_fit(
             size, fitter, keys, num_rows, capacity
@@ -31,6 +32,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             workloads.fit_seeds(fitter), params, keys, state, data, repeats=args.repeats
         )
         sizes = {
+            "engine": engine,
             "seeds": seeds,
             "rows": num_rows,
             "capacity": capacity,
@@ -50,6 +52,8 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Parses the flags, measures and reports."""
     parser = rows.parser(__doc__)
+    parser.add_argument("--engine", nargs="+", choices=("scan", "kernel"),
+                        default=["scan"], help="what trains")  # fmt: skip
     parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1, 4, 16])
     parser.add_argument("--rows", type=rows.positive, default=10_000, help="of data")
     parser.add_argument(

@@ -191,11 +191,19 @@ def planner(
 
 
 def fitter(
-    size: Size, num_epochs: int = 5, batch_size: int = 32
+    size: Size, num_epochs: int = 5, batch_size: int = 32, engine: str = "scan"
 ) -> jaxpets.typing.Fitter:
-    """Returns the trainer of PETS, in TF32 where the hardware has it."""
+    """Returns the trainer of PETS, in TF32 where the hardware has it.
+
+    Raises:
+      SystemExit: if there can be no kernel: the scan must not be timed in its name.
+    """
     config = jaxpets.FitConfig(num_epochs=num_epochs, batch_size=batch_size)
-    return jaxpets.fitter(model(size, "tf32"), optax.adam(1e-3), config)
+    build = {"scan": jaxpets.fitter, "kernel": jaxpets.fused_fitter}[engine]
+    built = build(model(size, "tf32"), optax.adam(1e-3), config)
+    if built.reason:
+        raise SystemExit(f"no kernel to time: {built.reason}")
+    return built
 
 
 def transitions(key: Array, num_rows: int) -> jaxpets.Transition:

@@ -43,7 +43,8 @@ def adam_of(optimizer: Optimizer) -> Adam | None:
     Returns:
       An Adam, or None if the optimizer is anything else.
     """
-    with jax.ensure_compile_time_eval():
+    # Optimizers of optax do not trace under strict promotion, if a caller set it.
+    with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
         params = jnp.zeros(2, jnp.float32)
         plain: Any = optax.adam(1.0).init(params)
         if jax.tree.structure(optimizer.init(params)) != jax.tree.structure(plain):

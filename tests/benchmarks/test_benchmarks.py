@@ -195,6 +195,9 @@ def test_rollout_and_fit(tmp_path):
     found = fit.main(["--seeds", "2", "--epochs", "2", *common])
     check_rows(found, path, {"us_per_update"})
     assert found[0]["sizes"]["updates"] == 2 * 4  # 100 rows, the last batch partial
+    assert found[0]["sizes"]["engine"] == "scan"
+    with pytest.raises(SystemExit, match="no kernel to time: the device is no GPU"):
+        fit.main(["--engine", "kernel", *common])
 
 
 def test_shapes(tmp_path):

@@ -21,7 +21,7 @@ The numbers. Parameters are packed once per plan, and handed over at every call:
 
     parameters -> weights, as the kernel reads them    {gpu,cpu}_layout: pack
     weights, shared numbers, keys, obs, actions -> path    the FFI call
-    parameters and Adam's moments -> the same, an epoch later    fit_layout: pack, unpack
+    parameters and moments -> the same, an epoch later    fit_layout: pack, unpack
 
 Who includes whom:
 
@@ -35,7 +35,7 @@ Who includes whom:
     cpu_rollout.cc      cpu_layout.h, handler.h
     fit_epoch.cu        fit_epoch.h, gpu_launch.h
     fit_reference.cc    fit_epoch.h
-    fit_epoch.h         fit_forward.h, fit_backward.h, fit_state.h: an epoch, and its parts
+    fit_epoch.h         fit_forward.h, fit_backward.h, fit_state.h: parts of an epoch
     these three         fit_block.h: what a block works with
     fit_block.h         fit_operands.h, which includes fit_sizes.h and xla_call.h
     fit_sizes.h         fit_device.h: Hopper's instructions, or fit_emulator.h: a CPU's
