@@ -54,8 +54,8 @@ def fused_fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) ->
       200 fit, four of 256 do not), or there are more members than clusters of 16 blocks
       on the GPU at once.
 
-    `step` may be mapped once, over seeds. One process trains so on a GPU at a time: the
-    blocks of all members wait for one another.
+    One process trains so on a GPU at a time: the blocks of all members wait for one
+    another.
 
     Args:
       ensemble: what to train, as `jaxpets.ensemble` built it. The kernel is made from
@@ -156,7 +156,7 @@ def _updates(
     totals = jax.ShapeDtypeStruct((members, layout.ctas, 2), jnp.float32)
     scratch = jax.ShapeDtypeStruct((layout.scratch_words,), jnp.uint32)
     results = (*(of_params,) * 3, bounds, count, totals, number, count, scratch)
-    call = jax.ffi.ffi_call(kernel.target, results, vmap_method="expand_dims")
+    call = jax.ffi.ffi_call(kernel.target, results, vmap_method="broadcast_all")
     # As fit_operands.h has them: before the epoch's number, and after it.
     first = [*adam, 1.0 - adam.b1, 1.0 - adam.b2, config.final_rate, config.num_epochs]
     last = [config.batch_size, model.bound_decay, *decays]

@@ -114,22 +114,22 @@ __global__ void __launch_bounds__(THREADS, 1)
   const int dims = OBS - rank * DIMS < 0 ? 0 : least(DIMS, OBS - rank * DIMS);
   const Block block{s, tid, tid / 32, tid % 32, rank, member, dims};
 
-  const float* hyper = fit.hyper + seed * fit.hyper_step;
-  const int size = fit.size[seed * fit.size_step], batch = int(hyper[BATCH]);
+  const float* hyper = fit.hyper + seed * NUM_HYPER;
+  const int size = fit.size[seed], batch = int(hyper[BATCH]);
   const int per_batch = (batch + ROWS - 1) / ROWS;
   const int num_batches = (size + batch - 1) / batch;
   const int num_chunks =
       size <= 0 ? 0
                 : (num_batches - 1) * per_batch +
                       (size - (num_batches - 1) * batch + ROWS - 1) / ROWS;
-  const Data data{fit.inputs + seed * fit.inputs_step,
-                  fit.targets + seed * fit.targets_step,
-                  fit.rows + seed * fit.rows_step + member * fit.capacity,
+  const Data data{fit.inputs + seed * fit.capacity * INPUTS,
+                  fit.targets + seed * fit.capacity * OBS,
+                  fit.rows + (seed * MEMBERS + member) * fit.capacity,
                   size, batch, num_chunks};
   uint32_t* scratch = fit.scratch + seed * SCRATCH;
   const float* all_bounds = reinterpret_cast<float*>(scratch + SCRATCH_BOUNDS);
 
-  int count = fit.count[seed * fit.count_step], skipped = 0;
+  int count = fit.count[seed], skipped = 0;
   float kept_rows = 0.0f;
   Moments moments;
   if (tid == 0)

@@ -1,6 +1,8 @@
 // The operands of a fit, and how XLA hands them over.
 #pragma once
 
+#include <type_traits>
+
 #include "fit_sizes.h"
 #include "xla_call.h"
 
@@ -15,22 +17,22 @@ enum Hyper { RATE, B1, B2, EPS, ONE_B1, ONE_B2, FINAL, EPOCHS, EPOCH, BATCH, BOU
 constexpr int SCRATCH_BAD = 32, SCRATCH_BOUNDS = 64;
 constexpr int SCRATCH = SCRATCH_BOUNDS + 2 * MEMBERS * OUTS;
 
-// Steps are zero for what seeds share.
+constexpr int NUM_HYPER = DECAYS + LAYERS + 1;
+
+// All operands have the seeds first.
 struct Fit {
-  const float *params, *m, *v;  // [MEMBERS, PARAMS]: parameters, Adam's moments
-  const float* bounds;          // [6, OBS]: low, high, their moments
-  const int32_t *count, *size;  // []
+  const float *params, *m, *v;    // [MEMBERS, PARAMS]: parameters, Adam's moments
+  const float* bounds;            // [6, OBS]: low, high, their moments
+  const int32_t *count, *size;    // []
   const float *inputs, *targets;  // [capacity, INPUTS], [capacity, OBS]
   const int32_t* rows;            // [MEMBERS, capacity]
-  const float* hyper;             // [DECAYS + LAYERS + 1]
+  const float* hyper;             // [NUM_HYPER]
   float *params_out, *m_out, *v_out, *bounds_out;
   int32_t* count_out;
   float* totals;      // [MEMBERS, CTAS, 2]: sums over rows of nll and mse
   float* num_rows;    // []
   int32_t* skipped;   // []
   uint32_t* scratch;  // [SCRATCH], zeros
-  int64_t params_step, m_step, v_step, bounds_step, count_step, size_step, inputs_step,
-      targets_step, rows_step, hyper_step;
   int64_t capacity;
   int num_seeds, first_seed;
 };
@@ -44,32 +46,31 @@ const char* read(const Call& call, Fit& fit) {
   const auto result = [&](int i) -> const Operand& {
     return *static_cast<const Operand*>(call.rets.rets[i]);
   };
-  const Operand &params = result(0), &rows = operand(8);
-  const int64_t axes = params.rank - 2;
-  if (axes < 0 || axes > 1) return "jax.vmap is nested too deeply";
-  for (int i = 0; i < 10; ++i)
-    if (operand(i).rank < axes) return "an operand lacks an axis";
-  if (params.dims[axes] != MEMBERS || params.dims[axes + 1] != PARAMS ||
+  const Operand &params = operand(0), &rows = operand(8);
+  const int64_t axes = params.rank - 2;  // what jax.vmap put in front
+  if (axes < 0 || rows.rank != axes + 2 || operand(6).rank != axes + 2 ||
+      operand(7).rank != axes + 2 || operand(9).rank != axes + 1 ||
+      params.dims[axes] != MEMBERS || params.dims[axes + 1] != PARAMS ||
       operand(6).dims[axes + 1] != INPUTS || operand(7).dims[axes + 1] != OBS ||
-      rows.dims[axes] != MEMBERS || operand(9).dims[axes] != DECAYS + LAYERS + 1 ||
+      rows.dims[axes] != MEMBERS || operand(9).dims[axes] != NUM_HYPER ||
       result(8).dims[axes] != SCRATCH)
     return "the operands are those of another model";
-  fit.num_seeds = axes ? int(params.dims[0]) : 1;
+  fit.num_seeds = 1;
+  for (int64_t i = 0; i < axes; ++i) fit.num_seeds *= int(params.dims[i]);
   fit.capacity = rows.dims[axes + 1];
-  const auto take = [&](int i, auto& data, int64_t& step) {
+  const auto take = [&](int i, auto& data) {
     data = static_cast<std::decay_t<decltype(data)>>(operand(i).data);
-    step = axes ? batch_stride(operand(i), 0) : 0;
   };
-  take(0, fit.params, fit.params_step);
-  take(1, fit.m, fit.m_step);
-  take(2, fit.v, fit.v_step);
-  take(3, fit.bounds, fit.bounds_step);
-  take(4, fit.count, fit.count_step);
-  take(5, fit.size, fit.size_step);
-  take(6, fit.inputs, fit.inputs_step);
-  take(7, fit.targets, fit.targets_step);
-  take(8, fit.rows, fit.rows_step);
-  take(9, fit.hyper, fit.hyper_step);
+  take(0, fit.params);
+  take(1, fit.m);
+  take(2, fit.v);
+  take(3, fit.bounds);
+  take(4, fit.count);
+  take(5, fit.size);
+  take(6, fit.inputs);
+  take(7, fit.targets);
+  take(8, fit.rows);
+  take(9, fit.hyper);
   const auto give = [&](int i, auto& data) {
     data = static_cast<std::decay_t<decltype(data)>>(result(i).data);
   };

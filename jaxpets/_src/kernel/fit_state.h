@@ -19,9 +19,8 @@ DEVICE void read_state(const Block& block, const Fit& fit, int64_t seed,
                        const float* hyper, Moments& moments) {
   Shared& s = block.s;
   const int tid = block.tid, rank = block.rank;
-  const float* p = fit.params + seed * fit.params_step + int64_t(block.member) * PARAMS;
-  const float* pm = fit.m + seed * fit.m_step + int64_t(block.member) * PARAMS;
-  const float* pv = fit.v + seed * fit.v_step + int64_t(block.member) * PARAMS;
+  const int64_t first = (seed * MEMBERS + block.member) * PARAMS;
+  const float *p = fit.params + first, *pm = fit.m + first, *pv = fit.v + first;
   each<SLOTS>([&](auto slot) {
     constexpr int SLOT = slot;
     const auto unit = block.unit_of(SLOT);
@@ -65,7 +64,7 @@ DEVICE void read_state(const Block& block, const Fit& fit, int64_t seed,
     s.vo[i] = own ? pv[from] : 0.0f;
     s.go[i] = 0.0f;
   }
-  const float* bounds = fit.bounds + seed * fit.bounds_step;
+  const float* bounds = fit.bounds + seed * 6 * OBS;
   for (int i = tid; i < 2 * DIMS; i += THREADS) {
     const int d = i % DIMS, which = i / DIMS, n = which * OBS + rank * DIMS + d;
     const bool own = d < block.dims;
@@ -169,9 +168,8 @@ DEVICE void write_state(const Block& block, const Fit& fit, int64_t seed,
   Shared& s = block.s;
   const int tid = block.tid, rank = block.rank;
   const int64_t member = seed * MEMBERS + block.member;
-  float* p = fit.params_out + member * PARAMS;
-  float* pm = fit.m_out + member * PARAMS;
-  float* pv = fit.v_out + member * PARAMS;
+  float *p = fit.params_out + member * PARAMS, *pm = fit.m_out + member * PARAMS,
+        *pv = fit.v_out + member * PARAMS;
   each<SLOTS>([&](auto slot) {
     constexpr int SLOT = slot;
     const auto unit = block.unit_of(SLOT);
