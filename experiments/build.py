@@ -51,7 +51,9 @@ class Parts(NamedTuple):
     bind: Bind  # what gives them the constants of a trial
     explored_by: str  # what imagines in phase 1, as env.json has it
     performed_by: str  # and in phase 2
+    fitter: jaxpets.typing.Fitter  # phase 1
     refitter: jaxpets.typing.Fitter | None  # between the phases
+    tuner: jaxpets.typing.Fitter  # phase 2
     finetuner: jaxpets.typing.Learner  # phase 2
 
 
@@ -101,13 +103,16 @@ def build(config: Config) -> Parts:
     random = jaxpets.random_planner(env.action_low, env.action_high)
 
     def learner(
-        fit: TrainingConfig, data: jaxpets.RewardData, length: int, capacity: int
+        fitter: jaxpets.typing.Fitter,
+        data: jaxpets.RewardData,
+        length: int,
+        capacity: int,
     ) -> jaxpets.typing.Learner:
-        fitter = _fitter(trained, fit)
         return jaxpets.learner(
             env, trained, fitter, data, trial_length=length, capacity=capacity
         )
 
+    fitter, tuner = _fitter(trained, config.training), _fitter(trained, config.tuning)
     explorer, explored_by = arm.planner or random, NOTHING
     if arm.reward_fn is not None:
         explorer, explored_by = planner(arm.reward_fn, config.planner)
@@ -130,19 +135,16 @@ def build(config: Config) -> Parts:
         actor=actor,
         with_policy=with_policy,
         critic=critic,
-        learner=learner(
-            config.training, arm.reward_data, config.trial_length, explored
-        ),
+        learner=learner(fitter, arm.reward_data, config.trial_length, explored),
         reward_data=arm.reward_data,
         bind=arm.bind,
         explored_by=explored_by,
         performed_by=performed_by,
+        fitter=fitter,
         refitter=_fitter(trained, config.refit) if config.refit.num_epochs else None,
+        tuner=tuner,
         finetuner=learner(
-            config.tuning,
-            jaxpets.RewardData(),
-            config.task_length,
-            explored + finetuned,
+            tuner, jaxpets.RewardData(), config.task_length, explored + finetuned
         ),
     )
 
@@ -217,8 +219,11 @@ def _without_noise(planner: jaxpets.Planner) -> jaxpets.Planner:
 def _fitter(
     ensemble: jaxpets.Ensemble, training: TrainingConfig
 ) -> jaxpets.typing.Fitter:
+    build = jaxpets.fused_fitter if training.fused else jaxpets.fitter
     adam = optax.adam(training.learning_rate)
-    return jaxpets.fitter(ensemble, adam, part(training, jaxpets.FitConfig))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".* trains as fitter")  # the phases say it
+        return build(ensemble, adam, part(training, jaxpets.FitConfig))
 
 
 def _ensemble(

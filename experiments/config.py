@@ -90,6 +90,8 @@ class TrainingConfig:
     """Share of the learning rate that is left at the end of a fit."""
     bootstrap: bool = FitConfig.bootstrap
     """Every member sees its own draw of the rows; otherwise all of them."""
+    fused: bool = False
+    """Train in one kernel, on Hopper GPUs: for one seed or a few, small batches."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,7 @@ from .config import Config
 from .model_file import Source
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
-from .phases import placed, say_rollout
+from .phases import placed, say_engines
 from .policy import export, make_distiller
 from .progress import Progress, Watch
 from .refit import refitted
@@ -78,7 +78,7 @@ def distill(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    say_rollout(run, parts.performed_by)
+    say_engines(run, parts.performed_by, parts.refitter)
     turns = max(config.distill.num_rounds, 1)
     learned_before = bool(run.steps())
     length = (3 if learned_before else turns + 2) * config.task_length

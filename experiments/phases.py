@@ -23,6 +23,7 @@ from .acting import Actors, Scorer, Tick, Trials
 from .build import (
     EXPLORE,
     FINETUNE,
+    KERNEL,
     SCAN,
     ZERO_SHOT,
     Learn,
@@ -126,7 +127,7 @@ class _Finetuning:
 def explore(config: Config, run: RunFolder, watch: Watch) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
-    say_rollout(run, parts.explored_by)
+    say_engines(run, parts.explored_by, parts.fitter)
     placement = placed(run, len(config.seeds))
     length, horizon = config.chunk_length, config.planner.horizon
     robot = parts.robot
@@ -170,7 +171,7 @@ def zero_shot(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    say_rollout(run, parts.performed_by)
+    say_engines(run, parts.performed_by, parts.refitter)
     model = prepared(config, source, run, step, parts, tasks)
     placement = placed(run, len(config.seeds), len(names), config.eval_trials)
     task_params = devices.place(placement, tasks.params, TASK)
@@ -221,7 +222,7 @@ def finetune(
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
     """
     parts = build(config)
-    say_rollout(run, parts.performed_by)
+    say_engines(run, parts.performed_by, parts.tuner)
     robot = parts.robot
     tasks = robots.chosen(config, robot)
     placement = placed(run, len(config.seeds), len(tasks.names))
@@ -264,13 +265,19 @@ def finetune(
         run.save_trajectories(paths)
 
 
-def say_rollout(run: RunFolder, rollout: str) -> None:
+def say_engines(
+    run: RunFolder, rollout: str, fitter: jaxpets.typing.Fitter | None = None
+) -> None:
     """Warns where numbers may be others than those so far, or come slowly."""
-    lines = [
-        f"{line}; the last bits may differ" for line in run.computes(rollout=rollout)
-    ]
+    engines = {"rollout": rollout}
+    if fitter:
+        kernel = f"{KERNEL} of {fitter.compiler}"
+        engines["fitter"] = kernel if fitter.uses_kernel else SCAN
+    lines = [f"{line}; the last bits may differ" for line in run.computes(**engines)]
     if not lines and rollout.startswith(f"{SCAN} ("):
         lines = [f"planning takes twice as long as in a kernel: it is a {rollout}"]
+    if fitter and fitter.reason:
+        lines.append(f"no kernel trains: {fitter.reason}")
     for line in lines:
         run.say(f"warning: {line}")
 

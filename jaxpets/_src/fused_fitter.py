@@ -50,9 +50,8 @@ def fused_fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) ->
       nvcc to build the kernel with;
     - the ensemble is none of `jaxpets.ensemble`, or its precision is not TF32;
     - the optimizer is not `optax.adam` with a constant rate;
-    - a layer has so many weights that 16 blocks have no room for the network (four of
-      200 fit, four of 256 do not), or there are more members than clusters of 16 blocks
-      on the GPU at once.
+    - the weights of a member have no room in 16 blocks (four layers of 256 fit, eight
+      of 200 do not), or the members have none on the GPU at once.
 
     One process trains so on a GPU at a time: the blocks of all members wait for one
     another.

@@ -1,3 +1,4 @@
+from types import SimpleNamespace
 from typing import get_args
 
 import chex
@@ -6,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxpets
-from experiments import cli, robots
+from experiments import cli, phases, robots
 from experiments.build import build
 from experiments.config import ArmName, Config
 from jaxpets import envs
@@ -70,6 +71,30 @@ def test_imagined_trials_end_where_real_ones_do(monkeypatch):
     build(config)
     explores, performs = (end(None, jnp.array([0.0, 2.0])[:, None]) for end in given)
     assert explores.tolist() == performs.tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("kernel", "named", "said"),
+    [
+        (dict(compiler="nvcc 13.0"), "kernel of nvcc 13.0", []),
+        (dict(reason="no nvcc"), "scan", ["warning: no kernel trains: no nvcc"]),
+    ],
+    ids=["kernel", "fallback"],
+)
+def test_what_trains_is_named(monkeypatch, kernel, named, said):
+    def build_fused(*parts):
+        return jaxpets.fitter(*parts)._replace(**kernel)
+
+    monkeypatch.setattr(jaxpets, "fused_fitter", build_fused)
+    phase = ["--phase", "explore", "--preset", "smoke", "--arm", "random"]
+    parts = build(cli.parse([*phase, "--training.fused"]))
+    assert not parts.tuner.uses_kernel and not parts.tuner.reason
+    found, lines = {}, []
+    run = SimpleNamespace(
+        computes=lambda **now: found.update(now) or [], say=lines.append
+    )
+    phases.say_engines(run, "scan", parts.fitter)
+    assert found == {"rollout": "scan", "fitter": named} and lines == said
 
 
 def test_pessimism_lowers_what_a_plan_is_worth():
