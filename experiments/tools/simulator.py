@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 import jaxpets
-from jaxpets.envs import Robot, env_rollout, with_constants
+from jaxpets.envs import Robot, Tasks, env_rollout, with_constants
 
 from .. import acting, robots
 from ..build import imagined_end, optimizer
@@ -27,7 +27,8 @@ from ..presets import PRESETS, quick_search
 from ..storage import metrics, rundir
 from ..storage.environment import environment
 
-_SEARCH = quick_search(PRESETS["paper"])
+_PAPER = PRESETS["paper"]
+_SEARCH = quick_search(_PAPER)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Arguments:
     """The robot, as `experiments.run` takes it."""
     tasks: str | None = None
     """FILE.py of your own: its tasks in place of the robot's."""
+    task: str = "all"
+    """What is performed, as `walk,run`."""
     seed: int = 0
     """Of all keys."""
     num_trials: int = 1
@@ -54,7 +57,7 @@ class Arguments:
 
 def perform(args: Arguments, robot: Robot) -> np.ndarray:
     """Returns the returns `[K, R]` of R trials of each of the K tasks."""
-    tasks, score = robot.tasks, acting.scorer(robot).score
+    tasks, scorer = _chosen(args, robot), acting.scorer(robot)
     search = optimizer(args.task_planner, robot.env)
     planner = jaxpets.plan(
         env_rollout(robot.env),
@@ -77,13 +80,17 @@ def perform(args: Arguments, robot: Robot) -> np.ndarray:
             length=args.trial_length,
             observe_fn=lambda state: state,
         )
-        return score(transitions, constants).returns
+        return scorer.score(transitions, constants).returns
 
     trials = jax.jit(jax.vmap(jax.vmap(trial, (None, 0)), (0, None)))
     keys = jax.random.split(jax.random.key(args.seed), args.num_trials)
-    returns = trials(tasks.params, keys)  # [K, R, K]
-    own = range(returns.shape[0])
-    return np.asarray(returns)[own, :, own]
+    returns = np.asarray(trials(tasks.params, keys))  # [K, R, all of the robot's]
+    each = zip(returns, robots.places(robot, tasks), strict=True)
+    return np.stack([of_task[:, place] for of_task, place in each])
+
+
+def _chosen(args: Arguments, robot: Robot) -> Tasks:
+    return robots.chosen(dataclasses.replace(_PAPER, task=args.task), robot)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,14 +98,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = tyro.cli(Arguments, args=argv, prog=f"{__package__}.simulator")
     try:
         robot = robots.named(args.env, args.engine, args.tasks)
+        robots.check_tasks(dataclasses.replace(_PAPER, task=args.task), robot)
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     begin = time.monotonic()
     where = {"date": rundir.now(), "env": environment()}
     returns = perform(args, robot)
-    width = max(11, *map(len, robot.tasks.names))
-    for name, own in zip(robot.tasks.names, returns, strict=True):
+    names = _chosen(args, robot).names
+    width = max(11, *map(len, names))
+    for name, own in zip(names, returns, strict=True):
         each = " ".join(f"{value:.0f}" for value in own)
         print(f"{name:<{width}}{own.mean():8.0f}   trials: {each}")
         rows = [

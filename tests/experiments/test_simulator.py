@@ -18,6 +18,21 @@ def test_it_searches_as_the_shipped_models_do():
     assert simulator.Arguments().task_planner.optimizer == "icem"
 
 
+def test_a_task_that_there_is_not_is_refused(capsys):
+    assert simulator.main(["--task", "forward,swim"]) == 2
+    assert "--task forward,swim is not valid; it must be all" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_one_task_is_performed_as_among_all(capsys):
+    """Keys are those of trials, not of tasks."""
+    common = ("--trial-length", "5", *TINY)
+    simulator.main(common)
+    line = capsys.readouterr().out.splitlines()[2]
+    simulator.main(["--task", TASK_NAMES[2], *common])
+    assert capsys.readouterr().out.splitlines() == [line]
+
+
 @pytest.mark.slow
 def test_every_task_is_performed_and_logged(tmp_path, capsys):
     """Even a search this small knows what comes next: no task goes backwards."""
