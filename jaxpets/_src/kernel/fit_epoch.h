@@ -35,8 +35,9 @@ struct Data {
   DEVICE void fetch_index(const Block& block, int q) const {
     if (q >= num_chunks) return;
     const Chunk c = chunk_of(q, size, batch);
+    // What fills a chunk up is a row of its own: one of the next batch may not be finite.
     for (int row = block.tid; row < ROWS; row += THREADS)
-      copy_async(&block.s.index[q % 3][row], rows + least(c.start + row, size - 1));
+      copy_async(&block.s.index[q % 3][row], rows + c.start + least(row, c.count - 1));
   }
   DEVICE void fetch_rows(const Block& block, int q) const {
     if (q >= num_chunks) return;
