@@ -54,9 +54,13 @@ def adam_of(optimizer: Optimizer) -> Adam | None:
             return None
         b1, b2 = (_rounded(1 - moment[0], 6) for moment in (state.mu, state.nu))
         share = float(seen[0, 1] / seen[0, 0])  # of a whole step
-        eps = _rounded(1e-8 / share - 1e-8, 4) if 0.0 < share < 1.0 else 0.0
+        # It is g (1 + eps) / (g + eps) for a gradient g.
+        is_less = 1e-8 < share < 1.0
+        eps = _rounded(1e-8 * (1.0 - share) / (share - 1e-8), 4) if is_less else 0.0
         unit, _ = _tried(optax.adam(1.0, b1, b2, eps))
-        rate = _rounded(seen[0, 0] / unit[0, 0], 6)
+        rate = float(seen[0, 0]) / float(unit[0, 0])
+        if np.isclose(_rounded(rate, 6), rate, rtol=5e-7, atol=0.0):
+            rate = _rounded(rate, 6)
         mine, _ = _tried(optax.adam(rate, b1, b2, eps))
     same = np.allclose(seen, mine, rtol=1e-6, atol=0.0)
     return Adam(rate, b1, b2, eps) if same else None
