@@ -45,14 +45,18 @@ def adam_of(optimizer: Optimizer) -> Adam | None:
     """
     # Optimizers of optax do not trace under strict promotion, if a caller set it.
     with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
-        params = jnp.zeros(2, jnp.float32)
-        plain: Any = optax.adam(1.0).init(params)
-        if jax.tree.structure(optimizer.init(params)) != jax.tree.structure(plain):
+        try:
+            seen, state = _tried(optimizer)
+        except Exception:
+            # It has a rate that is traced, or is for the parameters of a network alone,
+            # as with a mask: whatever its functions raise of these two numbers.
             return None
-        seen, state = _tried(optimizer)
+        plain: Any = optax.adam(1.0).init(jnp.zeros(2, jnp.float32))
+        if jax.tree.structure(state) != jax.tree.structure(plain):
+            return None
         if not np.all(seen):
             return None
-        b1, b2 = (_rounded(1 - moment[0], 6) for moment in (state.mu, state.nu))
+        b1, b2 = (_rounded(1 - moment[0], 6) for moment in (state[0].mu, state[0].nu))
         share = float(seen[0, 1] / seen[0, 0])  # of a whole step
         # It is g (1 + eps) / (g + eps) for a gradient g.
         is_less = 1e-8 < share < 1.0
@@ -75,7 +79,7 @@ def _tried(optimizer: Optimizer) -> tuple[FloatArray, Any]:
     for row in _PROBES:
         update, state = optimizer.update(jnp.asarray(row, jnp.float32), state, params)
         updates.append(np.asarray(cast(Array, update)))
-        states.append(state[0])
+        states.append(state)
     return np.stack(updates), states[0]
 
 
