@@ -88,9 +88,11 @@ def registered(monkeypatch):
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
-    """A library with the kernel's symbol, and nothing in it."""
+    """A library with the kernels' symbols, and nothing in it."""
     folder = tmp_path_factory.mktemp("tiny")
-    (folder / "tiny.c").write_text("int jaxpets_rollout(void) { return 0; }")
+    symbols = ("int jaxpets_rollout", "int jaxpets_fit", "char* jaxpets_problem")
+    lines = [f"{symbol}(void) {{ return 0; }}" for symbol in symbols]
+    (folder / "tiny.c").write_text("\n".join(lines))
     command = ["cc", "-shared", "-fPIC", "-o", folder / "tiny.so", folder / "tiny.c"]
     subprocess.run(command, check=True)
     return folder / "tiny.so"

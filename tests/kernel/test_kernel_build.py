@@ -77,6 +77,8 @@ def test_another_recipe_is_another_kernel(
         (Kind.MMA, "nvcc", "mma_rollout.cu", "CUDA"),
         (Kind.WGMMA_REFERENCE, "c++", "gpu_reference.cc", "cpu"),
         (Kind.CPU, "c++", "cpu_rollout.cc", "cpu"),
+        (Kind.FIT, "nvcc", "fit_epoch.cu", "CUDA"),
+        (Kind.FIT_REFERENCE, "c++", "fit_reference.cc", "cpu"),
     ],
 )
 def test_every_kind_is_a_library_of_its_own(
@@ -86,7 +88,8 @@ def test_every_kind_is_a_library_of_its_own(
     target, _ = load("// one", kind)
     ((name, *_, last),) = making.commands
     assert name == str(file) and Path(last).name == source
-    assert target.startswith(f"jaxpets_rollout_{kind.name.lower()}_")
+    assert target.startswith(f"{kind.symbol}_{kind.name.lower()}_")
+    assert kind.symbol == f"jaxpets_{'fit' if 'FIT' in kind.name else 'rollout'}"
     assert registered == [(target, registry)]
     assert kept(cache) == [target]
     (library,) = cache.iterdir()
