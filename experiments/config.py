@@ -251,6 +251,8 @@ class Evaluation:
     refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
     task_planner: PlannerConfig = PlannerConfig()
     critic: CriticConfig = CriticConfig()
+    policy: str | None = None
+    """zero-shot: FILE of distill, or pretrained/best: plans begin with its actions."""
 
 
 @dataclasses.dataclass(frozen=True)

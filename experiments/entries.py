@@ -35,8 +35,8 @@ Refuse = Callable[[str, Any, str | None], Exception]
 _PAST = ("random_trials", "training", "planner")
 _UNREAD = {
     "zero-shot": (*_PAST, "finetune_trials", "tuning", "distill"),
-    "finetune": (*_PAST, "eval_trials", "critic", "distill"),
-    "distill": (*_PAST, "finetune_trials", "tuning", "critic"),
+    "finetune": (*_PAST, "eval_trials", "critic", "policy", "distill"),
+    "distill": (*_PAST, "finetune_trials", "tuning", "critic", "policy"),
 }
 
 

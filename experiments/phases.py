@@ -7,6 +7,7 @@ trials are the leading axes of every array.
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import jax
@@ -18,7 +19,7 @@ import jaxpets
 from jaxpets.envs import Tasks
 from jaxpets.policies import Guided
 
-from . import acting, cost, exploration, loop, records, robots
+from . import acting, cost, exploration, loop, policy, records, robots
 from .acting import Actors, Scorer, Tick, Trials
 from .build import (
     EXPLORE,
@@ -171,6 +172,7 @@ def zero_shot(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
+    begins = policy.of_file(Path(config.policy), robot) if config.policy else None
     say_engines(run, parts.performed_by, parts.refitter)
     model = prepared(config, source, run, step, parts, tasks)
     placement = placed(run, len(config.seeds), len(names), config.eval_trials)
@@ -181,8 +183,12 @@ def zero_shot(
         task_params = Guided(task_params, networks)
         horizon = 1 / (1 - config.critic.discount)
         axes = Guided(axes, cast(Any, P(SEED, TASK)))
+    if begins:
+        task_params = Guided(task_params, devices.place(placement, begins.networks))
+        axes = Guided(axes, cast(Any, P()))
+    actor = policy.begun(parts, begins) if begins else parts.actor
     actors = acting.evaluators(
-        robot, parts.actor, horizon, config.chunk_length, placement,
+        robot, actor, horizon, config.chunk_length, placement,
         jaxpets.PlanParams(P(SEED), axes),
     )  # fmt: skip
     keys = trial_keys(config, ZERO_SHOT, step)

@@ -2,8 +2,9 @@
 
 import functools
 import operator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +12,15 @@ import optax
 from jax import Array
 
 import jaxpets
-from jaxpets.envs import Robot, Tasks
+from jaxpets import policies
+from jaxpets.envs import Robot, Tasks, with_constants
 from jaxpets.policies import (
     ActorCriticParams,
     DistillConfig,
     Distiller,
     Goals,
+    Guided,
+    load_policy,
     save_policy,
     to_onnx,
 )
@@ -25,6 +29,7 @@ from . import critic, model_file, user_files
 from .build import Parts, imagined_end
 from .config import Config
 from .entries import to_json
+from .errors import CheckpointError, UsageError
 from .storage import rundir
 from .storage.folder import RunFolder
 
@@ -83,6 +88,70 @@ def family(robot: Robot, count: int) -> Goals:
         return jnp.concatenate([*leaves, own.features(data)])
 
     return Goals(draw, features)
+
+
+class Policy(NamedTuple):
+    """What acts without a plan; its reward data are Guided."""
+
+    planner: jaxpets.Planner
+    networks: ActorCriticParams
+
+
+def of_file(path: Path, robot: Robot) -> Policy:
+    """Returns the policy in a file, for all tasks of a robot.
+
+    Args:
+      path: of the file, or `pretrained/NAME`.
+      robot: that acts by it.
+
+    Raises:
+      UsageError: if there is no such file.
+      CheckpointError: if it is no policy, or one of another robot or of other tasks.
+    """
+    path = model_file.named(path, "--policy", policies.path, plain="best")
+    goals = family(robot, len(robot.tasks.names))
+    try:
+        planner, networks = load_policy(path, goals=goals, space=robot.space)
+    except FileNotFoundError as error:
+        valid = "there is no such file"
+        raise UsageError(f"--policy {path} is not valid; {valid}.") from error
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(str(error)) from error
+    found = Policy(planner, networks)
+    task = jax.tree.map(lambda x: x[0], robot.tasks.params)
+    try:
+        output = jax.eval_shape(_acts(found, robot), task, jax.random.key(0))
+        fits = output.action.shape == robot.env.action_low.shape
+    except (TypeError, ValueError):  # of shapes that do not fit
+        fits = False
+    if not fits:
+        raise CheckpointError(f"{path} is a policy of another robot, or other tasks.")
+    return found
+
+
+def begun(parts: Parts, found: Policy) -> jaxpets.Planner:
+    """Returns the planner of phase 2, whose plans begin with what a policy would do.
+
+    Its reward data are Guided.
+    """
+    reward_fn = parts.robot.tasks.reward_fn
+
+    def reward(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
+        return reward_fn(data.reward, obs, action, next_obs)
+
+    return parts.with_policy(found.planner, reward)
+
+
+def _acts(found: Policy, robot: Robot) -> Callable[..., jaxpets.typing.PlanOutput]:
+    """Returns what a policy does at the start of a trial."""
+
+    def act(task: Any, key: Array) -> jaxpets.typing.PlanOutput:
+        state = robot.env.reset(key)
+        data = Guided(with_constants(task, state.constants), found.networks)
+        params = jaxpets.PlanParams((), data)
+        return found.planner.step(params, key, (), state.obs)[0]
+
+    return act
 
 
 def export(

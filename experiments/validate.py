@@ -71,6 +71,7 @@ def _check_critic(config: Config) -> None:
     if updates:
         alone = "0 with a critic, which is asked about one member at a time"
         require(not config.pessimism, "--pessimism", config.pessimism, alone)
+        require(not config.policy, "--policy", config.policy, "None with a critic")
 
 
 def _check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:

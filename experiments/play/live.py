@@ -14,9 +14,10 @@ from jax import Array
 import jaxpets
 from jaxpets import rewards
 from jaxpets.envs import Robot
-from jaxpets.policies import ActorCriticParams, Guided
+from jaxpets.policies import Guided
 
 from ..acting import at_start
+from ..policy import Policy
 from .command import Command, RewardChoice, bound, earned_of, reward_of
 from .geometry import pushes
 from .session import Frame
@@ -36,13 +37,6 @@ class World(NamedTuple):
     planner: Any
     number: Array
     qpos: Array
-
-
-class Policy(NamedTuple):
-    """What acts without a plan; its reward data are Guided."""
-
-    planner: jaxpets.Planner
-    networks: ActorCriticParams
 
 
 class Plan(NamedTuple):

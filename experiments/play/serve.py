@@ -15,6 +15,7 @@ import viser
 
 from .. import build
 from ..errors import UsageError
+from ..policy import of_file
 from . import command, source
 from .live import Live
 from .page import Page
@@ -78,7 +79,7 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     search = dataclasses.replace(found.search, horizon=horizon)
     rollout, _ = build.rollout_of(robot, found.size, search)
     file = options.policy or found.policy
-    policy = source.policy_of(file, robot) if file else None
+    policy = of_file(file, robot) if file else None
     live = Live(
         robot, rollout, build.optimizer(search, robot.env), found.params,
         horizon=horizon, terminal_fn=build.imagined_end(robot.env), policy=policy,

@@ -1,23 +1,17 @@
 """What a page is about: a robot, a model of it, and the search that plans with it."""
 
 import contextlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import jax
-from jax import Array
+from typing import NamedTuple
 
 import jaxpets
 from jaxpets import policies
-from jaxpets.envs import Robot, with_constants
-from jaxpets.policies import Guided, load_policy
+from jaxpets.envs import Robot
 
-from .. import build, exploration, model_file, policy, robots
+from .. import build, exploration, model_file, robots
 from ..config import PlannerConfig
-from ..errors import CheckpointError, UsageError
+from ..errors import UsageError
 from ..presets import quick_search
-from .live import Policy
 
 
 class Source(NamedTuple):
@@ -60,50 +54,6 @@ def robot_named(env: str) -> Robot:
     if robot.model is None or robot.qpos_fn is None:
         raise UsageError(f"--env {env} has no model that can be drawn.")
     return robot
-
-
-def policy_of(path: Path, robot: Robot) -> Policy:
-    """Returns the policy in a file, for all tasks of a robot.
-
-    Args:
-      path: of the file, or `pretrained/NAME`.
-      robot: that acts by it.
-
-    Raises:
-      UsageError: if there is no such file.
-      CheckpointError: if it is no policy, or one of another robot or of other tasks.
-    """
-    path = model_file.named(path, "--policy", policies.path, plain="best")
-    goals = policy.family(robot, len(robot.tasks.names))
-    try:
-        planner, networks = load_policy(path, goals=goals, space=robot.space)
-    except FileNotFoundError as error:
-        valid = "there is no such file"
-        raise UsageError(f"--policy {path} is not valid; {valid}.") from error
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(str(error)) from error
-    found = Policy(planner, networks)
-    task = jax.tree.map(lambda x: x[0], robot.tasks.params)
-    try:
-        output = jax.eval_shape(_acts(found, robot), task, jax.random.key(0))
-        fits = output.action.shape == robot.env.action_low.shape
-    except (TypeError, ValueError):  # of shapes that do not fit
-        fits = False
-    if not fits:
-        raise CheckpointError(f"{path} is a policy of another robot, or other tasks.")
-    return found
-
-
-def _acts(found: Policy, robot: Robot) -> Callable[..., jaxpets.typing.PlanOutput]:
-    """Returns what a policy does at the start of a trial."""
-
-    def act(task: Any, key: Array) -> jaxpets.typing.PlanOutput:
-        state = robot.env.reset(key)
-        data = Guided(with_constants(task, state.constants), found.networks)
-        params = jaxpets.PlanParams((), data)
-        return found.planner.step(params, key, (), state.obs)[0]
-
-    return act
 
 
 def _of_file(path: Path, said: str, env: str | None) -> Source:

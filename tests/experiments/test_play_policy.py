@@ -54,7 +54,7 @@ def cheetah():
 @pytest.fixture(scope="module")
 def found(cheetah, tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "policy-0.safetensors"
-    return source.policy_of(saved(*cheetah, path), cheetah[0])
+    return policy.of_file(saved(*cheetah, path), cheetah[0])
 
 
 @pytest.fixture(scope="module")
@@ -117,25 +117,25 @@ def test_a_model_that_came_along_brings_its_policy(cheetah, monkeypatch):
     robot = cheetah[0]
     monkeypatch.setattr(robots, "named", lambda *_: robot)
     assert source.found("pretrained/best", env="own.py").policy is None
-    own = source.policy_of(policies.path("best"), robot)
+    own = policy.of_file(policies.path("best"), robot)
     for said in ("pretrained/best", "pretrained"):  # there is no other
-        found = source.policy_of(Path(said), robot)
+        found = policy.of_file(Path(said), robot)
         np.testing.assert_array_equal(found.networks.mean, own.networks.mean)
     with pytest.raises(UsageError, match="--policy pretrained/bst is not valid; name"):
-        source.policy_of(Path("pretrained/bst"), robot)
+        policy.of_file(Path("pretrained/bst"), robot)
 
 
 def test_a_file_that_is_no_policy_of_the_robot_is_refused(cheetah, tmp_path):
     robot = cheetah[0]
     with pytest.raises(UsageError, match=r"--policy .* there is no such file"):
-        source.policy_of(tmp_path / "none.safetensors", robot)
+        policy.of_file(tmp_path / "none.safetensors", robot)
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes(b"x")
     with pytest.raises(CheckpointError, match=r"bad\.safetensors"):
-        source.policy_of(bad, robot)
+        policy.of_file(bad, robot)
     one = saved(*cheetah, tmp_path / "one.safetensors", goals=Goals())
     with pytest.raises(CheckpointError, match="of another robot, or other tasks"):
-        source.policy_of(one, robot)
+        policy.of_file(one, robot)
     walker = envs.make("dmc/walker", backend="mujoco")
     with pytest.raises(CheckpointError):
-        source.policy_of(one, walker)
+        policy.of_file(one, walker)

@@ -261,3 +261,32 @@ def test_a_run_is_watched_while_it_explores(explored, tmp_path):
             np.testing.assert_array_equal(chart.data[0], [1, 2, 3])
         assert "Trial 3 is shown. The run is " in page._part._text.content
     assert before == {x: x.stat().st_mtime_ns for x in begun.rglob("*")}
+
+
+@pytest.mark.slow
+def test_a_plan_begins_with_a_policy(tmp_path):
+    """Eight candidates find little, and do not lose what they are given."""
+    found = {}
+    for name, flags in (("alone", ()), ("begun", ("--policy", "pretrained/best"))):
+        more = ("--tag", name, "--task-length", "100")
+        assert zero_shot("pretrained/best", tmp_path, *flags, *more) == 0
+        (folder,) = (tmp_path / "pretrained-best").glob(f"zero-shot-060-*{name}")
+        (row,) = runs.rows(folder)
+        found[name] = row["returns"]["front-flip"]
+    assert found["begun"] > 2 * abs(found["alone"])
+
+
+def test_a_policy_that_will_not_do_is_refused_before_work_begins(
+    explored, tmp_path, capsys
+):
+    for source, path, words in (
+        ("best", "none.safetensors", "--policy none.safetensors is not valid"),
+        ("best", "pretrained/bst", "best"),
+        ("dmc/walker", "pretrained/best", "another robot"),
+    ):
+        assert zero_shot(f"pretrained/{source}", tmp_path, "--policy", path) != 0
+        assert words in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.rglob("metrics.jsonl"))
+    critic = ("--critic.num-updates", "9", "--policy", "pretrained/best")
+    assert zero_shot(explored, tmp_path, *critic, "--tag", "both") == 2
+    assert "None with a critic" in capsys.readouterr().err.splitlines()[-1]
