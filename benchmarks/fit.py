@@ -22,8 +22,12 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     num_rows = 100 if args.tiny else args.rows
     capacity = max(num_rows, args.capacity or 0)
     updates = args.epochs * -(-num_rows // args.batch_size)
+    fitters = {
+        engine: workloads.fitter(size, args.epochs, args.batch_size, engine)
+        for engine in args.engine
+    }
     for engine, seeds in itertools.product(args.engine, args.seeds):
-        fitter = workloads.fitter(size, args.epochs, args.batch_size, engine)
+        fitter = fitters[engine]
         keys = jax.random.split(jax.random.key(0), seeds)
         params, state, data = workloads.prepare_fit(
             size, fitter, keys, num_rows, capacity

@@ -26,10 +26,11 @@ from . import acting, cost, exploration, imagined_policy, records, robots, seen
 from .acting import Actors, Scorer, Trials
 from .build import DISTILL, Parts, State, build, key_per, trial_keys
 from .config import Config
+from .engines import say_engines
 from .model_file import Source
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
-from .phases import placed, say_engines
+from .phases import placed
 from .policy import export, make_distiller
 from .progress import Progress, Watch
 from .refit import refitted
@@ -78,7 +79,7 @@ def distill(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    say_engines(run, parts.performed_by, parts.refitter)
+    say_engines(run, parts.performed_by, refitter=parts.refitter)
     turns = max(config.distill.num_rounds, 1)
     learned_before = bool(run.steps())
     length = (3 if learned_before else turns + 2) * config.task_length

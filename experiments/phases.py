@@ -24,8 +24,6 @@ from .acting import Actors, Scorer, Tick, Trials
 from .build import (
     EXPLORE,
     FINETUNE,
-    KERNEL,
-    SCAN,
     ZERO_SHOT,
     Learn,
     State,
@@ -34,6 +32,7 @@ from .build import (
     trial_keys,
 )
 from .config import UNPLANNED, Config
+from .engines import say_engines
 from .model_file import Source
 from .parallel import devices
 from .parallel.devices import SEED, TASK, Placement
@@ -128,7 +127,7 @@ class _Finetuning:
 def explore(config: Config, run: RunFolder, watch: Watch) -> None:
     """Phase 1: trials without a reward (section 3.3), from the last checkpoint on."""
     parts = build(config)
-    say_engines(run, parts.explored_by, parts.fitter)
+    say_engines(run, parts.explored_by, fitter=parts.fitter)
     placement = placed(run, len(config.seeds))
     length, horizon = config.chunk_length, config.planner.horizon
     robot = parts.robot
@@ -173,7 +172,7 @@ def zero_shot(
         return
     parts = build(config)
     begins = policy.of_file(Path(config.policy), robot) if config.policy else None
-    say_engines(run, parts.performed_by, parts.refitter)
+    say_engines(run, parts.performed_by, refitter=parts.refitter)
     model = prepared(config, source, run, step, parts, tasks)
     placement = placed(run, len(config.seeds), len(names), config.eval_trials)
     task_params = devices.place(placement, tasks.params, TASK)
@@ -228,7 +227,8 @@ def finetune(
     Figure 4, right. Model, optimizer and data go on from where exploration ended.
     """
     parts = build(config)
-    say_engines(run, parts.performed_by, parts.tuner)
+    both = {"fitter": parts.tuner, "refitter": parts.refitter}
+    say_engines(run, parts.performed_by, **both)
     robot = parts.robot
     tasks = robots.chosen(config, robot)
     placement = placed(run, len(config.seeds), len(tasks.names))
@@ -269,23 +269,6 @@ def finetune(
         shown = Trials(seen, jnp.zeros(()), constants)
         paths = records.trajectories(phase.scorer, shown, config.seeds, tasks.names)
         run.save_trajectories(paths)
-
-
-def say_engines(
-    run: RunFolder, rollout: str, fitter: jaxpets.typing.Fitter | None = None
-) -> None:
-    """Warns where numbers may be others than those so far, or come slowly."""
-    engines = {"rollout": rollout}
-    if fitter:
-        kernel = f"{KERNEL} of {fitter.compiler}"
-        engines["fitter"] = kernel if fitter.uses_kernel else SCAN
-    lines = [f"{line}; the last bits may differ" for line in run.computes(**engines)]
-    if not lines and rollout.startswith(f"{SCAN} ("):
-        lines = [f"planning takes twice as long as in a kernel: it is a {rollout}"]
-    if fitter and fitter.reason:
-        lines.append(f"no kernel trains: {fitter.reason}")
-    for line in lines:
-        run.say(f"warning: {line}")
 
 
 def placed(run: RunFolder, *counts: int) -> Placement:

@@ -68,10 +68,13 @@ def _check_critic(config: Config) -> None:
         rounds, updates = config.distill.num_rounds, config.distill.critic.num_updates
         valid = "1 or more without --distill.critic.num-updates"
         require(rounds + updates > 0, "--distill.num-rounds", rounds, valid)
+    elif not is_read("critic", config.phase):
+        return
     if updates:
         alone = "0 with a critic, which is asked about one member at a time"
         require(not config.pessimism, "--pessimism", config.pessimism, alone)
-        require(not config.policy, "--policy", config.policy, "None with a critic")
+        has_policy = bool(config.policy) and is_read("policy", config.phase)
+        require(not has_policy, "--policy", config.policy, "None with a critic")
 
 
 def _check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:

@@ -95,10 +95,11 @@ def places(params: EnsembleParams) -> Places:
 
     Args:
       params: of the model; it is computed where they are. On a CPU there is nothing to
-        gain, and what is on several devices has no one place: JAX decides.
+        gain. Where there are several devices a planner may use them all, and then its
+        outputs have no one place: JAX decides.
     """
     devices = {x for leaf in jax.tree.leaves(params) for x in leaf.devices()}
-    if len(devices) != 1:
+    if len(devices) != 1 or jax.local_device_count() != 1:
         return None, None
     (device,) = devices
     kinds = {memory.kind for memory in device.addressable_memories()}

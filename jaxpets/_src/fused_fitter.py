@@ -1,12 +1,9 @@
 """Training as one kernel: all updates of an epoch in one call."""
 
 import warnings
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array
 
 from jaxpets._src.ensemble import Ensemble
 from jaxpets._src.ensemble_config import EnsembleConfig, layer_decays
@@ -40,8 +37,9 @@ def fused_fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) ->
     another order, so the last bits differ, and what follows from them.
 
     It is for one seed, or few, and small batches: of one seed an update with 32 rows
-    takes 25 us on an H100, where that of `fitter` takes 92. Seeds that are mapped go
-    one after another; from about five on, or with batches of 256, `fitter` is as fast.
+    took 25 us on an H100, where that of `fitter` takes 92 (an earlier form of the
+    kernel, see "A fit" in benchmarks/README.md). Seeds that are mapped go one after
+    another: four take 97 us, and `fitter` 129. With batches of 256 it gains nothing.
 
     Where there can be no kernel the result is that of `fitter`, which then says why in
     `reason`, and a warning of one line is given:
@@ -49,12 +47,14 @@ def fused_fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) ->
     - the device is no GPU of compute capability 9.0 (H100, H200, GH200), or there is no
       nvcc to build the kernel with;
     - the ensemble is none of `jaxpets.ensemble`, or its precision is not TF32;
-    - the optimizer is not `optax.adam` with a constant rate;
+    - the optimizer is not `optax.adam` with a constant rate, or has an eps of 0;
     - the weights of a member have no room in 16 blocks (four layers of 256 fit, eight
-      of 200 do not), or the members have none on the GPU at once.
+      of 200 do not), or the members have none on the GPU at once;
+    - there are four or more hidden layers, so narrow and unequal that some blocks have
+      a part in some of them only.
 
-    One process trains so on a GPU at a time: the blocks of all members wait for one
-    another.
+    One process trains so on a GPU at a time. The blocks of all members wait for one
+    another, and what waits for four seconds ends the process with an error of CUDA.
 
     Args:
       ensemble: what to train, as `jaxpets.ensemble` built it. The kernel is made from
@@ -94,8 +94,7 @@ def fitter_of_kind(
         kernel = load_kernel(layout.header(), kind, arch)
     except (BuildError, UnsupportedError) as error:
         return fitter(ensemble, optimizer, config)._replace(reason=str(error))
-    decays = layer_decays(_config(ensemble))
-    updates = _updates(layout, kernel, adam, config, _config(ensemble), decays)
+    updates = _updates(layout, kernel, adam, config, _config(ensemble))
     made = of_epochs(ensemble, optimizer, config, updates)
     return made._replace(compiler=kernel.compiler)
 
@@ -134,7 +133,10 @@ def _layout(ensemble: Ensemble, **sizes: int) -> FitLayout:
 def _adam(optimizer: Optimizer) -> Adam:
     adam = adam_of(optimizer)
     if adam is None:
-        raise UnsupportedError("the optimizer is not optax.adam with a constant rate")
+        raise UnsupportedError(
+            "the optimizer is not optax.adam with a constant rate, or its numbers were "
+            "not found"
+        )
     return adam
 
 
@@ -144,7 +146,6 @@ def _updates(
     adam: Adam,
     config: FitConfig,
     model: EnsembleConfig,
-    decays: tuple[float, ...],
 ) -> EpochFn:
     """Returns all updates of an epoch as one call of a kernel."""
     members, size = layout.num_members, layout.obs_size
@@ -156,18 +157,26 @@ def _updates(
     scratch = jax.ShapeDtypeStruct((layout.scratch_words,), jnp.uint32)
     results = (*(of_params,) * 3, bounds, count, totals, number, count, scratch)
     call = jax.ffi.ffi_call(kernel.target, results, vmap_method="broadcast_all")
-    # As fit_operands.h has them: before the epoch's number, and after it.
-    first = [*adam, 1.0 - adam.b1, 1.0 - adam.b2, config.final_rate, config.num_epochs]
-    last = [config.batch_size, model.bound_decay, *decays]
+    same = {
+        **adam._asdict(),
+        "one_b1": 1.0 - adam.b1,
+        "one_b2": 1.0 - adam.b2,
+        "final": config.final_rate,
+        "epochs": config.num_epochs,
+        "batch": config.batch_size,
+        "bound_decay": model.bound_decay,
+    }
 
     def updates(progress: Progress, epoch: Epoch) -> Progress:
         state = progress.opt_state[0]
         trees = (progress.network, state.mu, state.nu)
         packed = [layout.pack(tree.members["params"]) for tree in trees]
         rows = [b for tree in trees for b in (tree.min_logvar, tree.max_logvar)]
-        hyper = jnp.concatenate(
-            [_numbers(first), epoch.number[None], _numbers(last)], dtype=jnp.float32
-        )
+        for name, x in zip(("inputs", "targets"), epoch.data, strict=True):
+            if x.dtype != jnp.float32:
+                raise TypeError(
+                    f"{name} of the ensemble must be float32, got {x.dtype}."
+                )
         *new, low_high, count, totals, num_rows, skipped, _ = call(
             *packed,
             jnp.stack(rows),
@@ -175,7 +184,7 @@ def _updates(
             epoch.size.astype(jnp.int32),
             *epoch.data,
             epoch.rows.astype(jnp.int32),
-            hyper,
+            layout.hyper(layer_decays(model), **same, epoch=epoch.number),
         )
 
         def tree(i: int) -> NetworkParams:
@@ -190,7 +199,3 @@ def _updates(
         return Progress(tree(0), opt_state, progress.num_skipped + skipped, shown)
 
     return updates
-
-
-def _numbers(values: list[Any]) -> Array:
-    return jnp.asarray(np.asarray(values, np.float32))

@@ -41,7 +41,7 @@ def adam_of(optimizer: Optimizer) -> Adam | None:
     found does is compared with what it does.
 
     Returns:
-      An Adam, or None if the optimizer is anything else.
+      An Adam, or None if the optimizer is anything else, or has an eps of 0.
     """
     # Optimizers of optax do not trace under strict promotion, if a caller set it.
     with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
@@ -61,6 +61,8 @@ def adam_of(optimizer: Optimizer) -> Adam | None:
         # It is g (1 + eps) / (g + eps) for a gradient g.
         is_less = 1e-8 < share < 1.0
         eps = _rounded(1e-8 * (1.0 - share) / (share - 1e-8), 4) if is_less else 0.0
+        if eps <= 0.0:  # what has no gradient would become 0 / 0 in a kernel
+            return None
         unit, _ = _tried(optax.adam(1.0, b1, b2, eps))
         rate = float(seen[0, 0]) / float(unit[0, 0])
         if np.isclose(_rounded(rate, 6), rate, rtol=5e-7, atol=0.0):

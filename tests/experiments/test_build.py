@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxpets
-from experiments import cli, phases, robots
+from experiments import cli, engines, robots
 from experiments.build import build
 from experiments.config import ArmName, Config
 from jaxpets import envs
@@ -93,7 +93,7 @@ def test_what_trains_is_named(monkeypatch, kernel, named, said):
     run = SimpleNamespace(
         computes=lambda **now: found.update(now) or [], say=lines.append
     )
-    phases.say_engines(run, "scan", parts.fitter)
+    engines.say_engines(run, "scan", fitter=parts.fitter, refitter=None)
     assert found == {"rollout": "scan", "fitter": named} and lines == said
 
 

@@ -69,7 +69,7 @@ class Fit:
         return jaxpets.fitter(*self.arguments())
 
     def fused(self):
-        """With the kernel of the first device, as a user has it."""
+        """As a user asks for it: with the kernel of the first device, if it has one."""
         return jaxpets.fused_fitter(*self.arguments())
 
     @functools.cache  # noqa: B019

@@ -18,13 +18,15 @@ from fits import (
 )
 
 import jaxpets
+from jaxpets._src.fused_fitter import fitter_of_kind
+from jaxpets._src.kernel.build import Kind
 from jaxpets._src.network import ACTIVATIONS
 
 # Other features than the observation, and more of them.
 SPACE = jaxpets.delta_space()._replace(
     features=lambda obs: jnp.concatenate([jnp.sin(obs), jnp.cos(obs[..., 1:])], -1)
 )
-# With as many threads as gradients of biases are added up by, so in one go.
+# 64 threads, so that the gradients of biases do not need two rounds.
 COSINE = SMALL.but(batch_size=10, final_rate=0.1, bootstrap=False, threads=64)
 CASES = {
     # Of 70 rows: batches of 32, and one of 6; of 10; of 40, in chunks of 32 and 8.
@@ -212,3 +214,20 @@ def test_the_size_of_the_paper():
     assert_same_fit(got, want, close=2e-4)
     way = distance(want[0], start(case)[0])
     assert distance(got[0], want[0]) < 1e-4 * way
+
+
+def test_data_of_another_type_are_refused():
+    """The kernel would read them as they are not."""
+    ensemble, optimizer, config = SMALL.arguments()
+
+    def encode(scaler, data):
+        return tuple(x.astype(jnp.float16) for x in ensemble.encode(scaler, data))
+
+    sizes = dict(ctas=SMALL.ctas, threads=SMALL.threads)
+    made = fitter_of_kind(
+        ensemble._replace(encode=encode), optimizer, config, Kind.FIT_REFERENCE, **sizes
+    )
+    params = SMALL.params()
+    args = params, jax.random.key(0), made.init(params), SMALL.dataset(20)
+    with pytest.raises(TypeError, match="inputs .* must be float32, got float16"):
+        jax.eval_shape(made.step, *args)

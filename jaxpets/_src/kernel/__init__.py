@@ -39,6 +39,7 @@ Who includes whom:
     these three         fit_block.h: what a block works with
     fit_block.h         fit_operands.h, which includes fit_sizes.h and xla_call.h
     fit_sizes.h         fit_device.h: Hopper's instructions, or fit_emulator.h: a CPU's
+    fit_emulator.h      fit_machine.h: clusters of fibers in place of a GPU
     handler.h           rollout.h and xla_call.h: the operands as XLA hands them over
     xla_call.h          XLA's c_api.h: what XLA calls
     rollout.h           sizes.h: the operands, and how far apart their numbers lie

@@ -35,7 +35,7 @@ struct Data {
   DEVICE void fetch_index(const Block& block, int q) const {
     if (q >= num_chunks) return;
     const Chunk c = chunk_of(q, size, batch);
-    // What fills a chunk up is a row of its own: one of the next batch may not be finite.
+    // A short chunk is filled up with its batch's rows: the next one's may not be finite.
     for (int row = block.tid; row < ROWS; row += THREADS)
       copy_async(&block.s.index[q % 3][row], rows + c.start + least(row, c.count - 1));
   }

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxpets._src.network import ACTIVATIONS
 
@@ -16,6 +17,11 @@ SHARED_MEMORY = 232_448
 # A thread's registers for gradients and moments; more would spill.
 _MOST_NUMBERS = 168
 _UNIT, _TILE = 16, 8  # inputs and columns of a tensor core instruction
+# What an epoch is told besides its data, in this order; the decays of all layers last.
+_HYPER = (
+    "RATE", "B1", "B2", "EPS", "ONE_B1", "ONE_B2",  # of Adam: ONE_B1 is 1 - B1
+    "FINAL", "EPOCHS", "EPOCH", "BATCH", "BOUND_DECAY",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +73,10 @@ class FitLayout:
         """Returns why there is no kernel for it, or None."""
         if not self.hidden_sizes:
             return "there is no hidden layer"
+        # A block without columns does not wait; with four layers it may come too early.
+        used = {-(-size // -(-size // self.ctas)) for size in self.hidden_sizes}
+        if len(self.hidden_sizes) > 3 and len(used) > 1:
+            return "some blocks have columns in some hidden layers and not in others"
         if self.shared_bytes(self.rows) > SHARED_MEMORY:
             return "the weights do not fit into the shared memory of 16 blocks"
         warps = self.threads // 32
@@ -92,7 +102,15 @@ class FitLayout:
         }
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
         widths = ", ".join(map(str, self.hidden_sizes))
+        lines.append(f"enum Hyper {{ {', '.join(_HYPER)}, DECAYS }};")
         return "\n".join(["#pragma once", *lines, f"#define WIDTHS {widths}"])
+
+    def hyper(self, decays: Sequence[float], **numbers: ArrayLike) -> Array:
+        """Returns what an epoch is told, `[N]`: numbers by the names of _HYPER."""
+        if set(numbers) != set(map(str.lower, _HYPER)):
+            raise ValueError(f"{sorted(numbers)} are not the numbers of an epoch")
+        told = [numbers[name.lower()] for name in _HYPER] + list(decays)
+        return jnp.stack([jnp.asarray(number, jnp.float32) for number in told])
 
     @property
     def _columns(self) -> int:

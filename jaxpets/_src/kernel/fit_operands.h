@@ -8,10 +8,6 @@
 
 namespace {
 
-// What `hyper` has, in this order; the decays of all layers come last.
-enum Hyper { RATE, B1, B2, EPS, ONE_B1, ONE_B2, FINAL, EPOCHS, EPOCH, BATCH, BOUND_DECAY,
-             DECAYS };
-
 // Words of the scratch of a seed: how many blocks have come, which of three steps were
 // bad, and the gradients of the bounds by all members in two steps.
 constexpr int SCRATCH_BAD = 32, SCRATCH_BOUNDS = 64;
