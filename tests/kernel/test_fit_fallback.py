@@ -18,7 +18,10 @@ from jaxpets._src.kernel.build import Kernel, Kind
 # In a script: $2 is then where the library goes.
 OUTPUT = 'while [ "$1" != -o ]; do shift; done'
 NO_GPU = "the device is no GPU of compute capability 9.0"
-NO_ADAM = "the optimizer is not optax.adam with a constant rate, or its numbers were not found"
+NO_ADAM = (
+    "the optimizer is not optax.adam with a constant rate, or its numbers were "
+    "not found"
+)
 NO_ROOM = "the weights do not fit into the shared memory of 16 blocks"
 NO_REGISTERS = "Adam's moments do not fit into the registers of 16 blocks"
 

@@ -164,7 +164,7 @@ def test_what_is_too_large_has_a_problem(hidden_sizes, obs_size, rows, problem):
 def test_a_block_has_columns_in_all_of_many_layers_or_in_none(hidden_sizes, fits):
     """Parts of gradients come into two buffers in turn: who does not wait is too early.
 
-    With `(8, 5, 8, 8)` on four blocks gradients were wrong by 2 % before it was refused.
+    With `(8, 5, 8, 8)` on four blocks gradients were wrong by 2 %.
     """
     problem = FitLayout(2, 3, 2, 3, hidden_sizes, "swish", ctas=4).problem()
     assert (problem is None) == fits and (fits or "some blocks" in problem)

@@ -229,5 +229,5 @@ def test_data_of_another_type_are_refused():
     )
     params = SMALL.params()
     args = params, jax.random.key(0), made.init(params), SMALL.dataset(20)
-    with pytest.raises(TypeError, match="inputs .* must be float32, got float16"):
+    with pytest.raises(TypeError, match=r"inputs .* must be float32, got float16"):
         jax.eval_shape(made.step, *args)
