@@ -251,8 +251,6 @@ class Evaluation:
     refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
     task_planner: PlannerConfig = PlannerConfig()
     critic: CriticConfig = CriticConfig()
-    policy: str | None = None
-    """zero-shot: FILE of distill, or pretrained/best: plans begin with its actions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,6 +277,8 @@ class Variant:
     """The tasks to perform, as walk,run; by default all of the robot."""
     tasks: str | None = None
     """FILE.py of your own: `def tasks()` gives rewards, in place of the robot's."""
+    policy: str | None = None
+    """zero-shot: FILE of distill, or pretrained/best: plans begin with its actions."""
     tag: str | None = None
     """Name of a variant of phase 2, with other numbers and its own folder."""
 

@@ -98,7 +98,7 @@ def test_what_a_stranger_may_write_is_a_name_or_a_path_or_refused(value):
             assert entry.name in str(error) and str(error).isprintable()
         else:
             taken.add(entry.name)
-    texts = {"env", "task", "tasks", "name", "tag", "coordinator_address"}
+    texts = {"env", "task", "tasks", "policy", "name", "tag", "coordinator_address"}
     assert taken == texts | {"out", "video", "source"}
     with pytest.raises(CheckpointError) as error:
         from_json({value: 1}, Config(), "runs/x/config.json")
