@@ -96,6 +96,7 @@ OTHERS = {
     "decay in the second part": with_decay(1e-3, 0.1),
     "for some parameters": optax.masked(optax.adam(1e-3), all_but_a_bound),
     "NaN": optax.adam(float("nan")),
+    "a rate of zero": optax.adam(0.0),
 }
 
 
