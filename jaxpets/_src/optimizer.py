@@ -52,8 +52,7 @@ def adam_of(optimizer: Optimizer) -> Adam | None:
             # as with a mask: whatever its functions raise of these two numbers.
             return None
         plain: Any = optax.adam(1.0).init(jnp.zeros(2, jnp.float32))
-        is_adam = jax.tree.structure(state) == jax.tree.structure(plain)
-        if not is_adam or not np.all(seen):
+        if jax.tree.structure(state) != jax.tree.structure(plain) or not np.all(seen):
             return None
         b1, b2 = (_rounded(1 - moment[0], 6) for moment in (state[0].mu, state[0].nu))
         share = float(seen[0, 1] / seen[0, 0])  # of a whole step
