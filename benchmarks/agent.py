@@ -68,7 +68,8 @@ def memory() -> str:
     """Returns the kind of memory through which `act` gets its action."""
     device = jax.devices()[0]
     kinds = {one.kind for one in device.addressable_memories()}
-    if device.platform == "gpu" and "pinned_host" in kinds:
+    is_alone = jax.local_device_count() == 1
+    if device.platform == "gpu" and is_alone and "pinned_host" in kinds:
         return "pinned_host"
     return device.default_memory().kind
 
