@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import jaxpets
 from jaxpets import Precision, coordinates
 from jaxpets._src.fused_rollout import rollout_of_kind
 from jaxpets._src.kernel import build
-from jaxpets._src.kernel.build import Kind
+from jaxpets._src.kernel.build import Kernel, Kind
 from jaxpets.envs import half_cheetah as hc
 from jaxpets.envs.observations import readings
 
@@ -244,6 +245,24 @@ ENGINES = [
 @functools.cache
 def scan(case):
     return jax.jit(case.scan())
+
+
+def pretend(monkeypatch, platform="gpu", **attributes):
+    """Makes JAX's only device one of another kind."""
+    device = SimpleNamespace(platform=platform, **attributes)
+    monkeypatch.setattr(jax, "devices", lambda: [device])
+
+
+def kernels_of(monkeypatch, module):
+    """Builds no kernels; returns those asked for: model, kind, and for which GPU."""
+    seen = []
+
+    def load_kernel(model, kind, arch):
+        seen.append((model, kind, arch))
+        return Kernel("target", "nvcc 13.0")
+
+    monkeypatch.setattr(module, "load_kernel", load_kernel)
+    return seen
 
 
 def recorded(call):

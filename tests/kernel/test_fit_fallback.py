@@ -2,18 +2,18 @@
 
 import importlib.util
 import subprocess
-from types import SimpleNamespace
 
 import fits
 import jax
 import optax
 import pytest
 from fits import SMALL, module, recorded, start
+from rollouts import kernels_of, pretend
 
 import jaxpets
 from jaxpets import FitConfig, Precision
 from jaxpets._src.kernel import build
-from jaxpets._src.kernel.build import Kernel, Kind
+from jaxpets._src.kernel.build import Kind
 
 # In a script: $2 is then where the library goes.
 OUTPUT = 'while [ "$1" != -o ]; do shift; done'
@@ -26,11 +26,6 @@ NO_ROOM = "the weights do not fit into the shared memory of 16 blocks"
 NO_REGISTERS = "Adam's moments do not fit into the registers of 16 blocks"
 
 
-def pretend(monkeypatch, platform="gpu", **attributes):
-    device = SimpleNamespace(platform=platform, **attributes)
-    monkeypatch.setattr(jax, "devices", lambda: [device])
-
-
 @pytest.fixture
 def hopper(monkeypatch):
     pretend(monkeypatch, compute_capability="9.0")
@@ -38,15 +33,7 @@ def hopper(monkeypatch):
 
 @pytest.fixture
 def asked(monkeypatch):
-    """What is to be built: the model, its kind, and for which GPU."""
-    seen = []
-
-    def load_kernel(model, kind, arch):
-        seen.append((model, kind, arch))
-        return Kernel("target", "nvcc 13.0")
-
-    monkeypatch.setattr(module, "load_kernel", load_kernel)
-    return seen
+    return kernels_of(monkeypatch, module)
 
 
 def assert_is_the_fitter(arguments, words, args):

@@ -3,7 +3,6 @@
 import dataclasses
 import shutil
 import subprocess
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -14,6 +13,8 @@ from rollouts import (
     SMALL,
     SOURCES,
     Case,
+    kernels_of,
+    pretend,
     recorded,
     relative_error,
     stacked,
@@ -22,7 +23,7 @@ from rollouts import (
 import jaxpets
 from jaxpets import Precision
 from jaxpets._src import fused_rollout as module
-from jaxpets._src.kernel.build import Kernel, Kind
+from jaxpets._src.kernel.build import Kind
 
 PAPER = dataclasses.replace(CHEETAH, hidden_sizes=(200,) * 4)
 WIDE = dataclasses.replace(CASES["free joint"], obs_size=13, hidden_sizes=(256,) * 2)
@@ -31,22 +32,9 @@ GELU = dataclasses.replace(PAPER, activation="gelu")
 KINDS = [Kind.WGMMA, Kind.MMA]  # on a GPU that has both
 
 
-def pretend(monkeypatch, **attributes):
-    device = SimpleNamespace(platform="gpu", **attributes)
-    monkeypatch.setattr(jax, "devices", lambda: [device])
-
-
 @pytest.fixture
 def asked(monkeypatch):
-    """What is to be built: the model, its kind, and for which GPU."""
-    seen = []
-
-    def load_kernel(model, kind, arch):
-        seen.append((model, kind, arch))
-        return Kernel("target", "nvcc 13.0")
-
-    monkeypatch.setattr(module, "load_kernel", load_kernel)
-    return seen
+    return kernels_of(monkeypatch, module)
 
 
 @pytest.mark.parametrize(

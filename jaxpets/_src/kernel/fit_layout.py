@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from jaxpets._src.kernel.gpu_layout import round_up
 from jaxpets._src.network import ACTIVATIONS
 
 # Of a block, on Hopper.
@@ -115,26 +116,29 @@ class FitLayout:
     @property
     def _columns(self) -> int:
         """Columns of a block in the widest layer, in whole tiles."""
-        most = -(-max(self.hidden_sizes) // self.ctas)
-        return -(-most // _TILE) * _TILE
+        return round_up(self._own, _TILE)
+
+    @property
+    def _own(self) -> int:
+        """Columns of a block in the widest layer."""
+        return -(-max(self.hidden_sizes) // self.ctas)
 
     def shared_bytes(self, rows: int) -> int:
         """Returns the shared memory of a block, as fit_block.h declares it."""
         layers, outs = len(self.hidden_sizes), 2 * self.obs_size
         columns, warps = self._columns, self.threads // 32
-        own = -(-max(self.hidden_sizes) // self.ctas)
         dims = -(-self.obs_size // self.ctas)
         fan_in = self.sizes[:-2]
         words = sum(fan_in) * (columns + 4)  # w
         words += 2 * fan_in[0] * rows + (sum(fan_in[1:]) * rows or 32)  # x
         words += (1 + layers) * columns * rows  # h, dy
-        words += max(2 * self.ctas * own, warps * columns) * rows  # part
+        words += max(2 * self.ctas * self._own, warps * columns) * rows  # part
         words += (2 * self.ctas * dims + outs + 2 * dims) * rows  # z, dyo, target
         words += 4 * columns * (outs + 1) + 4 * layers * columns  # of outputs, biases
         words += 5 * 4 * dims + layers + 1  # biases and bounds of outputs, sums, decays
         words += 8 + 1 + 3 * rows  # adam, good, index
-        size = -(-4 * words // 8) * 8 + 8 * (2 * layers + 2)  # barriers
-        return -(-size // 128) * 128
+        size = round_up(4 * words, 8) + 8 * (2 * layers + 2)  # barriers
+        return round_up(size, 128)
 
     def pack(self, layers: Mapping[str, Any]) -> Array:
         """Returns kernels and biases of all layers, `[E, num_params]`.

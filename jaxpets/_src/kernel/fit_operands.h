@@ -54,31 +54,28 @@ const char* read(const Call& call, Fit& fit) {
   fit.num_seeds = 1;
   for (int64_t i = 0; i < axes; ++i) fit.num_seeds *= int(params.dims[i]);
   fit.capacity = rows.dims[axes + 1];
-  const auto take = [&](int i, auto& data) {
-    data = static_cast<std::decay_t<decltype(data)>>(operand(i).data);
+  const auto find = [](const Operand& there, auto& data) {
+    data = static_cast<std::decay_t<decltype(data)>>(there.data);
   };
-  take(0, fit.params);
-  take(1, fit.m);
-  take(2, fit.v);
-  take(3, fit.bounds);
-  take(4, fit.count);
-  take(5, fit.size);
-  take(6, fit.inputs);
-  take(7, fit.targets);
-  take(8, fit.rows);
-  take(9, fit.hyper);
-  const auto give = [&](int i, auto& data) {
-    data = static_cast<std::decay_t<decltype(data)>>(result(i).data);
-  };
-  give(0, fit.params_out);
-  give(1, fit.m_out);
-  give(2, fit.v_out);
-  give(3, fit.bounds_out);
-  give(4, fit.count_out);
-  give(5, fit.totals);
-  give(6, fit.num_rows);
-  give(7, fit.skipped);
-  give(8, fit.scratch);
+  find(operand(0), fit.params);
+  find(operand(1), fit.m);
+  find(operand(2), fit.v);
+  find(operand(3), fit.bounds);
+  find(operand(4), fit.count);
+  find(operand(5), fit.size);
+  find(operand(6), fit.inputs);
+  find(operand(7), fit.targets);
+  find(operand(8), fit.rows);
+  find(operand(9), fit.hyper);
+  find(result(0), fit.params_out);
+  find(result(1), fit.m_out);
+  find(result(2), fit.v_out);
+  find(result(3), fit.bounds_out);
+  find(result(4), fit.count_out);
+  find(result(5), fit.totals);
+  find(result(6), fit.num_rows);
+  find(result(7), fit.skipped);
+  find(result(8), fit.scratch);
   return nullptr;
 }
 
