@@ -37,9 +37,9 @@ def fused_fitter(ensemble: Ensemble, optimizer: Optimizer, config: FitConfig) ->
     another order, so the last bits differ, and what follows from them.
 
     It is for one seed, or few, and small batches: of one seed an update with 32 rows
-    took 25 us on an H100, where that of `fitter` takes 92 (an earlier form of the
-    kernel, see "A fit" in benchmarks/README.md). Seeds that are mapped go one after
-    another: four take 97 us, and `fitter` 129. With batches of 256 it gains nothing.
+    takes 26 us on an H100, where that of `fitter` takes 85. Seeds that are mapped go
+    one after another: four take 97 us, and `fitter` 128; eight take as long by both.
+    With batches of 256 it gains nothing.
 
     Where there can be no kernel the result is that of `fitter`, which then says why in
     `reason`, and a warning of one line is given:
