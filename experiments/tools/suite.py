@@ -3,7 +3,7 @@
 Reads the zero-shot logs of `dmc/...` robots, or the file of results that was made of
 them, and prints a table in Markdown: means over seeds with 95 % intervals, means of the
 tasks, and what others have published. If an arm lacks tasks, a row has the means of
-those that every arm has.
+those that every arm has. With `--than ARM` the arms are those that have all its tasks.
 """
 
 import argparse
@@ -107,9 +107,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
-    lines = table(found, peers)
-    if args.than is not None:
-        lines += ["", *differences(found, args.than)]
+    if args.than is None:
+        lines = table(found, peers)
+    else:
+        arms = {
+            x: own for x, own in found.items() if own.keys() >= found[args.than].keys()
+        }
+        lines = [*table(arms, peers), "", *differences(arms, args.than)]
     print("\n".join(lines))
     return 0
 

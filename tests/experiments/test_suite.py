@@ -131,7 +131,7 @@ def test_the_committed_numbers_of_others_are_of_every_task():
 
 def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
     results = Path(__file__).parents[2] / "results"
-    for arm in ("best", "epistemic", "random", "opax"):
+    for arm in ("best", "epistemic", "random", "opax", "plan2explore"):
         with tarfile.open(results / "dmc20" / f"{arm}.tar.xz") as logs:
             logs.extractall(tmp_path, filter="data")
     found = suite.results(tmp_path, 100, "")
@@ -141,21 +141,22 @@ def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
     front = (results.parent / "README.md").read_text()
     for line in capsys.readouterr().out.splitlines():
         if line.startswith(("| **mean**", *(f"| {name}" for name in suite.NAMES))):
-            task, epistemic, random, best, _, *others = line.strip("| ").split(" | ")
+            task, epistemic, random, best, _, _, *others = line.strip("| ").split(" | ")
             assert " | ".join([task, best, epistemic, random, *others[:4]]) in page
         if line.startswith(("| **mean**", "| the other domains")):
-            _, epistemic, random, best, _, *others = line.strip("| ").split(" | ")
+            _, epistemic, random, best, _, _, *others = line.strip("| ").split(" | ")
             assert " | ".join([best, epistemic, random, *others[:3]]) in front
 
 
-def test_the_page_compares_an_arm_that_lacks_tasks_with_the_others(capsys):
+@pytest.mark.parametrize(("arm", "tasks"), [("opax", 18), ("plan2explore", 7)])
+def test_the_page_compares_an_arm_that_lacks_tasks_with_the_others(arm, tasks, capsys):
     results = Path(__file__).parents[2] / "results"
-    flags = ["--peers", str(PEERS_FILE), "--than", "opax"]
+    flags = ["--peers", str(PEERS_FILE), "--than", arm]
     assert suite.main([str(results / "dmc20.json"), *flags]) == 0
     page = (results / "dmc20.md").read_text()
-    said, compared = capsys.readouterr().out.split("| task | `opax` |")
+    said, compared = capsys.readouterr().out.split(f"| task | `{arm}` |")
     assert compared.strip() in page
-    common = next(x for x in said.splitlines() if x.startswith("| the 18 tasks"))
+    common = next(x for x in said.splitlines() if x.startswith(f"| the {tasks} tasks"))
     assert all(cell in page for cell in common.strip("| ").split(" | ")[1:5])
 
 
