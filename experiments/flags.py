@@ -18,7 +18,7 @@ from tyro.constructors import (
 
 from . import calling
 from .config import Basics, Config, Science, Variant, part
-from .entries import entries, flag, hints, read
+from .entries import entries, flag, hints, is_read, read
 from .errors import UsageError
 from .place import Compute, Origin, Output, Process
 
@@ -106,16 +106,34 @@ def of(
       UsageError: if the value of a flag is not valid.
       SystemExit: after `--help`.
     """
+    shown = default if command is None else _without_unread(default, command)
     found, rest = tyro.cli(
-        role,
+        type(shown),
         args=list(argv),
-        default=default,
+        default=shown,
         return_unknown_args=True,
         add_help=command is not None,
         registry=_AS_WRITTEN,
         prog=calling.usage("run", command),
     )
     return read(role, _given(found), default, _refuse), rest
+
+
+def _without_unread(default: T, phase: str) -> T:
+    """Returns defaults whose `--help` leaves out what a phase does not read.
+
+    Such flags are still taken, to be refused by name.
+    """
+    hidden = [
+        (name, Annotated[hint, tyro.conf.Suppress], getattr(default, name))
+        for name, hint in hints(type(default)).items()
+        if not is_read(name, phase)
+    ]
+    role: Any = dataclasses.make_dataclass(
+        "Shown", hidden, bases=(type(default),), frozen=True
+    )
+    role.__doc__ = type(default).__doc__
+    return role(**vars(default))
 
 
 def explain(default: Config) -> None:
