@@ -199,9 +199,15 @@ def zero_shot(
     num_chunks = config.task_length // config.chunk_length
     progress = Progress(config.task_length, 0, "zero-shot", watch)
     progress.compiling(cost.compiling("plan"))
+
+    def tick(steps: int) -> None:
+        progress.tick(steps)
+        rate, left = progress.pace()
+        run.update(steps_per_second=rate, seconds_left=left)
+
     begin = time.monotonic()
     with progress.interruptible():
-        trials = acting.run(actors, params, keys, num_chunks, progress.tick)
+        trials = acting.run(actors, params, keys, num_chunks, tick)
     trials = devices.collect(placement, trials, *devices.AXES)
     arm = rundir.label(config.arm)
     common = {"phase": "zero-shot", "arm": arm, "explored_trials": step}

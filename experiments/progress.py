@@ -12,7 +12,8 @@ from .errors import StoppedTogether
 from .parallel import distributed
 from .signals import first_signal
 
-# A log file gets a line per trial, no bar.
+# A log file gets a line per trial, no bar; and one where there was none for so long.
+_SILENCE = 60.0  # seconds
 _BAR = (
     "{desc} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} steps "
     "[{elapsed} < {remaining}, {rate_fmt}]"
@@ -54,7 +55,7 @@ class Progress:
             smoothing=0.1,
         )
         self._what = what
-        self._start = time.monotonic()
+        self._start = self._said = time.monotonic()
         self._first, self._total, self._done = done, total, done
         self._stop = 0
 
@@ -67,6 +68,8 @@ class Progress:
         self.did(self._what, steps)
         self._done += steps
         self._bar.update(steps)
+        if not sys.stderr.isatty() and time.monotonic() - self._said > _SILENCE:
+            self.line(f"{self._what} {self._done}/{self._total} steps")
         if number := distributed.agree(self._stop):
             raise StoppedTogether(signal.Signals(number).name)
 
@@ -94,6 +97,7 @@ class Progress:
 
     def line(self, text: str) -> None:
         """Prints a line above the bar, with the time left where no bar shows it."""
+        self._said = time.monotonic()
         if not self._shown:
             return
         if not sys.stderr.isatty():

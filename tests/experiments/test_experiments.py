@@ -231,6 +231,8 @@ def test_two_seeds_through_all_phases(
         assert main(zero_shot) == 75
     assert "\nstopped: SIGTERM; " in capsys.readouterr().err
     assert status(folder / "zero-shot-003-back-flip") == "interrupted"
+    shown = json.loads((folder / "zero-shot-003-back-flip/status.json").read_text())
+    assert shown["steps_per_second"] > 0
     # A video that cannot be made does not fail the run that it shows.
     assert main(zero_shot) == 0
     errors = capsys.readouterr().err

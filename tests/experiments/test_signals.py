@@ -11,6 +11,7 @@ import textwrap
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -178,6 +179,24 @@ def test_a_loop_stops_at_its_next_tick():
         progress.tick(5)
         done.append("the next")
     assert done == ["the step under way"]
+
+
+def test_a_log_gets_a_line_where_there_was_none_for_a_minute(monkeypatch, capsys):
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("experiments.progress.time", clock)
+    progress = Progress(1000, 0, "walk", Watch())
+
+    def ticks(*times):
+        for now[0] in times:
+            progress.tick(100)
+        return capsys.readouterr().err.splitlines()
+
+    said = ["walk 200/1000 steps  [3.3 steps/s, 4.0 min left]"]
+    assert ticks(130.0, 160.5, 190.0, 220.0) == said
+    progress.line("a trial")
+    assert len(ticks(230.0, 270.0)) == 1  # the trial's
+    assert len(ticks(290.0)) == 1
 
 
 def test_a_tick_that_does_not_come_is_not_waited_for(monkeypatch, capsys):
