@@ -2,6 +2,7 @@
 
 from jaxpets.envs.adapters import env_rollout, from_brax
 from jaxpets.envs.mujoco_env import mujoco_env
+from jaxpets.envs.mujoco_robot import mujoco_robot
 from jaxpets.envs.named import make, names, registries
 from jaxpets.envs.robot import Axis, Robot, Tasks, tasks_of, with_constants
 
@@ -13,6 +14,7 @@ __all__ = [
     "from_brax",
     "make",
     "mujoco_env",
+    "mujoco_robot",
     "names",
     "registries",
     "tasks_of",

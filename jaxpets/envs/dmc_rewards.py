@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.types import RewardFn
-from jaxpets.envs.recipe import Entry, Rewards
+from jaxpets.envs.mujoco_robot import Entry
+from jaxpets.envs.recipe import Rewards
 from jaxpets.envs.tolerance import linear, quadratic, tolerance
 
 _SPIN_RATE = 10.0  # rad/s, of a flip; ours

@@ -11,7 +11,8 @@ import numpy as np
 from jax import Array
 
 from jaxpets._src.types import RewardFn
-from jaxpets.envs.recipe import Entry, Rewards
+from jaxpets.envs.mujoco_robot import Entry
+from jaxpets.envs.recipe import Rewards
 
 # `(observations) -> what a step earns besides`.
 HealthFn = Callable[[Array], Array]

@@ -9,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxpets._src.coordinates import index, space
-from jaxpets._src.types import Coordinate, Env, EnvState, RewardFn
+from jaxpets._src.types import Env, EnvState, RewardFn
 from jaxpets.envs.mujoco_env import ConstantsFn, ResetFn, mujoco_env
-from jaxpets.envs.robot import Axis, Robot, TrialParams, tasks_of
-from jaxpets.envs.tracks import qpos_fn
+from jaxpets.envs.mujoco_robot import Entry, Shown, mujoco_robot
+from jaxpets.envs.robot import Robot, TrialParams
 
-# `(entry's name) -> its place in the observation`.
-Entry = Callable[[str], int]
 Rewards = Mapping[str, RewardFn]
 
 
@@ -30,7 +27,7 @@ class Recipe(NamedTuple):
       observe: as `mujoco_env` takes it.
       rewards: `(model, entry) -> rewards` by task, of one control step.
       start: `(model) -> ResetFn`.
-      axes: name, unit, entry, and the ends of a histogram's bins, of two quantities.
+      axes: as `mujoco_robot` takes them.
       camera: of the model, that follows the robot or sees all of it, if it has one.
       angle: the entry of which turns are counted, if any.
       settle_time: in s.
@@ -44,7 +41,7 @@ class Recipe(NamedTuple):
     observe: tuple[str, ...]
     rewards: Callable[[Any, Entry], Rewards]
     start: Callable[[Any], ResetFn]
-    axes: tuple[tuple[str, str, str, float], tuple[str, str, str, float]]
+    axes: tuple[Shown, Shown]
     camera: str | None = None
     angle: str | None = None
     settle_time: float = 0.0
@@ -67,41 +64,37 @@ def build(name: str, model: Any, recipe: Recipe, backend: str = "mujoco") -> Rob
     Raises:
       ValueError: for a backend that is none, or cannot step the model.
     """
+    settings: dict[str, Any] = {
+        "observe": recipe.observe,
+        "control_step": recipe.control_step,
+        "action_repeat": recipe.action_repeat,
+        "settle_time": recipe.settle_time,
+        "constants": recipe.constants(model) if recipe.constants else None,
+        "backend": backend,
+    }
 
-    def env_of(start: Callable[[Any], ResetFn]) -> Env:
-        return mujoco_env(
-            model,
-            observe=recipe.observe,
-            control_step=recipe.control_step,
-            action_repeat=recipe.action_repeat,
-            reset=start(model),
-            settle_time=recipe.settle_time,
-            constants=recipe.constants(model) if recipe.constants else None,
-            backend=backend,
-        )
+    def tasks(entry: Entry) -> Rewards:
+        found = recipe.rewards(model, entry)
+        return {name: _repeated(found[name], recipe.action_repeat) for name in found}
 
-    env = env_of(recipe.start)
-    rows = env.coordinates
-    found = recipe.rewards(model, lambda entry: index(rows, entry))
-    elsewhere = [(env_of(start), tasks) for start, tasks in recipe.task_starts]
-    first, second = (_axis(rows, *axis) for axis in recipe.axes)
-    step_time = recipe.control_step * recipe.action_repeat
-    return Robot(
-        name=name,
-        env=env,
-        space=space(rows),
-        tasks=tasks_of(
-            {task: _repeated(found[task], recipe.action_repeat) for task in found}
-        ),
-        axes=(first, second),
-        angle=index(rows, recipe.angle) if recipe.angle else None,
-        model=model,
-        qpos_fn=qpos_fn(model, rows, step_time),
+    robot = mujoco_robot(
+        name,
+        model,
+        tasks,
+        axes=recipe.axes,
+        angle=recipe.angle,
         camera=recipe.camera,
-        task_reset=_task_reset(env, tuple(found), elsewhere) if elsewhere else None,
-        action_repeat=recipe.action_repeat,
-        step_time=step_time,
+        reset=recipe.start(model),
+        **settings,
     )
+    elsewhere = [
+        (mujoco_env(model, reset=start(model), **settings), names)
+        for start, names in recipe.task_starts
+    ]
+    if not elsewhere:
+        return robot
+    task_reset = _task_reset(robot.env, robot.tasks.names, elsewhere)
+    return robot._replace(task_reset=task_reset)
 
 
 def _task_reset(
@@ -129,10 +122,3 @@ def _repeated(reward_fn: RewardFn, action_repeat: int) -> RewardFn:
         return action_repeat * reward_fn(params, obs, action, next_obs)
 
     return reward
-
-
-def _axis(
-    rows: tuple[Coordinate, ...], name: str, unit: str, entry: str, end: float
-) -> Axis:
-    edges = tuple(end * i / 15 for i in range(-15, 16))
-    return Axis(name, unit, index(rows, entry), edges)

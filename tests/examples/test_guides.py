@@ -41,6 +41,23 @@ def test_a_guide_shows_lines_of_examples_or_what_is_run_here(guide):
     assert len(pages.own(f"docs/{guide}.md")) == OWN.get(guide, 0)
 
 
+def test_the_robot_of_a_page_earns_and_can_be_drawn(tmp_path, monkeypatch):
+    (block,) = pages.blocks("experiments/README.md")
+    (tmp_path / "cart.xml").write_text(
+        """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-2 2"/>
+        <geom size=".1"/></body></worldbody>
+        <actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+    )
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(block, names)
+    robot = names["robot"]("mujoco")
+    obs, action = jnp.array([0.5, 2.0]), jnp.zeros(1)
+    got = [robot.tasks.reward_fn(x, obs, action, obs) for x in robot.tasks.params]
+    np.testing.assert_allclose(got, [-0.25, 2.0])
+    assert robot.qpos_fn(obs[None]) == 0.5 and robot.axes[0].entry == 0
+
+
 def test_the_models_of_a_guide_plan():
     names = pages.execute("docs/own_model.md")
     assert names["plan"].action.shape == (1,)
