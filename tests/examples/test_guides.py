@@ -44,8 +44,8 @@ def test_a_guide_shows_lines_of_examples_or_what_is_run_here(guide):
 def test_the_robot_of_a_page_earns_and_can_be_drawn(tmp_path, monkeypatch):
     (block,) = pages.blocks("experiments/README.md")
     (tmp_path / "cart.xml").write_text(
-        """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-2 2"/>
-        <geom size=".1"/></body></worldbody>
+        """<mujoco><worldbody><body><geom size=".1"/>
+        <joint name="x" type="slide" axis="1 0 0" range="-2 2"/></body></worldbody>
         <actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
     )
     monkeypatch.chdir(tmp_path)
