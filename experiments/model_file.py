@@ -5,6 +5,7 @@ performs, but there are no data to learn on.
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -41,6 +42,10 @@ class ModelFile(NamedTuple):
     """What performing needs of the folder of a run, of a file."""
 
     path: Path
+
+    def digest(self) -> str:
+        """Returns what no other file has: the folder of its results is of its name."""
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()
 
     def steps(self) -> list[int]:
         """Returns the trials behind the model: one number, 0 if the file has none."""

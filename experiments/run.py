@@ -99,7 +99,8 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
         return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / cli.variant(config, step)
-    with _opened(config, folder) as run:
+    model = source.digest() if isinstance(source, ModelFile) else None
+    with _opened(config, folder, model) as run:
         from . import distilling, phases
 
         perform = {
@@ -114,7 +115,9 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
 
 
 @contextmanager
-def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
+def _opened(
+    config: Config, path: Path, model: str | None = None
+) -> Iterator["RunFolder"]:
     """Holds the folder of a run that a signal may stop."""
     from .storage import folder
 
@@ -125,7 +128,7 @@ def _opened(config: Config, path: Path) -> Iterator["RunFolder"]:
     size = _NEEDED_BYTES * branches
     with (
         signals.stoppable() as late,
-        folder.open_run(path, plain, differences, size) as run,
+        folder.open_run(path, plain, differences, size, model) as run,
         _plain_errors(config),
     ):
         if distributed.is_first() and not distributed.is_alone():

@@ -249,8 +249,9 @@ class RunFolder(NamedTuple):
 
 @contextlib.contextmanager
 def open_run(
-    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int
-) -> Iterator[RunFolder]:
+    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
+    model: str | None = None,
+) -> Iterator[RunFolder]:  # fmt: skip
     """Holds a run's folder for as long as the run lasts: locked, and accounted for.
 
     Args:
@@ -258,14 +259,15 @@ def open_run(
       config: in JSON; kept beside what comes of it.
       differences: says what of two configs differs and may not.
       needed_bytes: how much must be free there.
+      model: digest of the file of a model that the run starts from, if it is one.
 
     Raises:
-      CheckpointError: if the folder is in use or belongs to another config.
+      CheckpointError: if the folder is in use, or of another config or model.
       StorageError: if it cannot be written to.
     """
     writer = Writer(path, config["phase"])
     tracked = Tracked(path, config)
-    held = _held(path, config, differences, needed_bytes, writer, tracked)
+    held = _held(path, config, differences, needed_bytes, model, writer, tracked)
     with distributed.held_by_first(held):
         own = (writer, tracked) if distributed.is_first() else (None, None)
         yield RunFolder(path, tuple(config["milestones"]), config, differences, *own)
@@ -274,12 +276,14 @@ def open_run(
 @contextlib.contextmanager
 def _held(
     path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
-    writer: Writer, tracked: Tracked,
+    model: str | None, writer: Writer, tracked: Tracked,
 ) -> Iterator[None]:  # fmt: skip
     with rundir.lock(path):
         disk.sweep(path)
         rundir.probe(path, needed_bytes)
-        _describe(path, config, differences)
+        identity.settle(path, config, differences, model)
+        for line in remember(path / rundir.ENVIRONMENT, environment()):
+            distributed.say(f"warning: {line}")
         writer.begin()
         try:
             with contextlib.closing(tracked):
@@ -291,10 +295,3 @@ def _held(
                 writer.end(state, errors.reason(error))
             raise
         writer.end(status.COMPLETE)
-
-
-def _describe(path: Path, config: dict[str, Any], differences: Differences) -> None:
-    """Writes config and environment of a new run, compares those of an old one."""
-    identity.settle(path, config, differences)
-    for line in remember(path / rundir.ENVIRONMENT, environment()):
-        distributed.say(f"warning: {line}")

@@ -1,8 +1,10 @@
 """Whose a folder and its checkpoints are.
 
 A folder gets a config and an id when it is made. Its checkpoints carry both, so that
-one which came from elsewhere is known, whatever its shapes are. Folders and checkpoints
-of older versions have no id, and are taken as they are.
+one which came from elsewhere is known, whatever its shapes are. The folder of what a
+file of a model performs knows the bytes of that file, as its name may soon be of
+another. Folders and checkpoints of older versions have none of this, and are taken as
+they are.
 """
 
 import os
@@ -19,19 +21,30 @@ Differences = Callable[[Any, Any, str], list[str]]
 _GOAL = "num_trials"  # which trial completes a run; not a part of which run it is
 
 
-def settle(path: Path, config: dict[str, Any], differences: Differences) -> None:
+def settle(
+    path: Path, config: dict[str, Any], differences: Differences,
+    model: str | None = None,
+) -> None:  # fmt: skip
     """Gives a new folder its config and its id; compares the config of an old one.
 
     An old one may be given more trials.
 
+    Args:
+      path: of the folder.
+      config: of now, in JSON.
+      differences: between two configs.
+      model: digest of the file of a model that the run starts from, if it is one.
+
     Raises:
-      CheckpointError: if it is of other numbers.
+      CheckpointError: if it is of other numbers, or of another model.
     """
     own = path / rundir.CONFIG
+    _check_model(path, config, model)
     if not own.exists():
         known = (path / rundir.IDENTITY).exists()
         if not known and not checkpoint.steps(path / rundir.CHECKPOINTS):
-            rundir.write_json(path / rundir.IDENTITY, {"id": secrets.token_hex(8)})
+            made = {"id": secrets.token_hex(8), "model": model}
+            rundir.write_json(path / rundir.IDENTITY, made)
         rundir.write_json(own, config)
         return
     began = rundir.read_json(own)
@@ -43,6 +56,19 @@ def settle(path: Path, config: dict[str, Any], differences: Differences) -> None
         )
     if config.get(_GOAL, 0) > began.get(_GOAL, 0):
         rundir.write_json(own, began | {_GOAL: config[_GOAL]})
+
+
+def _check_model(path: Path, config: Mapping[str, Any], model: str | None) -> None:
+    """Refuses a folder of another model; that of an older version does not say."""
+    known = rundir.find_json(path / rundir.IDENTITY)
+    if known.get("model", model) == model:
+        return
+    began = rundir.find_json(path / rundir.CONFIG)
+    now, then = (x.get("source") or path.parent for x in (config, began))
+    raise CheckpointError(
+        f"{path} was started with another model than that of {now}: with that of "
+        f"{then} at the time. Use another --tag or another --out."
+    )
 
 
 def read_id(path: Path) -> str | None:

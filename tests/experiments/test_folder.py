@@ -346,6 +346,14 @@ def test_a_run_of_an_older_version_goes_on(tmp_path, capsys):
         resumed(path)
 
 
+def test_a_folder_of_an_older_version_does_not_say_of_which_model_it_is(tmp_path):
+    path = recorded(tmp_path / "a")
+    with pytest.raises(CheckpointError, match="with another model than that of"):
+        identity.settle(path, CONFIG, differences, "digest")
+    rundir.write_json(path / rundir.IDENTITY, {"id": identity.read_id(path)})
+    identity.settle(path, CONFIG, differences, "digest")
+
+
 # Nothing is written elsewhere.
 
 

@@ -167,6 +167,21 @@ def test_a_file_that_says_little_performs(file, tmp_path):
     assert row["explored_trials"] == 0
 
 
+def test_results_are_of_one_file(file, tmp_path, capsys):
+    """Of the same name are another file, and the same one saved again."""
+    assert zero_shot(file, tmp_path / "out") == 0
+    (folder,) = (tmp_path / "out" / "mine").iterdir()
+    before = (folder / "metrics.jsonl").read_bytes()
+    path = again(file, tmp_path / "mine.safetensors", note="of somebody else")
+    assert zero_shot(path, tmp_path / "out") == 3
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"another model than that of {path}: with that of {file}" in said
+    shutil.copy(file, path)  # which is the same model, wherever it is
+    assert zero_shot(path, tmp_path / "out") == 0
+    assert "already complete" in capsys.readouterr().err
+    assert (folder / "metrics.jsonl").read_bytes() == before
+
+
 def test_layers_of_several_widths_are_refused(tmp_path, capsys):
     env = jaxpets.envs.make("pets/half_cheetah", backend="mujoco")
     sizes = jaxpets.EnsembleConfig(num_members=2, hidden_sizes=(4, 8))
