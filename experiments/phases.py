@@ -171,7 +171,9 @@ def zero_shot(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    begins = policy.of_file(Path(config.policy), robot) if config.policy else None
+    begins = None
+    if config.policy:
+        begins = policy.of_file(Path(config.policy), robot, config.env, names)
     say_engines(run, parts.performed_by, refitter=parts.refitter)
     model = prepared(config, source, run, step, parts, tasks)
     placement = placed(run, len(config.seeds), len(names), config.eval_trials)

@@ -2,7 +2,7 @@
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import optax
 from jax import Array
 
 import jaxpets
-from jaxpets import policies
+from jaxpets import models, policies
 from jaxpets.envs import Robot, Tasks, with_constants
 from jaxpets.policies import (
     ActorCriticParams,
@@ -97,12 +97,16 @@ class Policy(NamedTuple):
     networks: ActorCriticParams
 
 
-def of_file(path: Path, robot: Robot) -> Policy:
-    """Returns the policy in a file, for all tasks of a robot.
+def of_file(path: Path, robot: Robot, env: str, names: Sequence[str]) -> Policy:
+    """Returns the policy in a file.
+
+    A file that says nothing of itself, as any of `save_policy` may, need only fit.
 
     Args:
       path: of the file, or `pretrained/NAME`.
       robot: that acts by it.
+      env: what the command line calls it.
+      names: of its tasks that are performed.
 
     Raises:
       UsageError: if there is no such file.
@@ -111,12 +115,14 @@ def of_file(path: Path, robot: Robot) -> Policy:
     path = model_file.named(path, "--policy", policies.path, plain="best")
     goals = family(robot, len(robot.tasks.names))
     try:
+        about = models.about(path)
         planner, networks = load_policy(path, goals=goals, space=robot.space)
     except FileNotFoundError as error:
         valid = "there is no such file"
         raise UsageError(f"--policy {path} is not valid; {valid}.") from error
     except (TypeError, ValueError) as error:
         raise CheckpointError(str(error)) from error
+    _check_about(path, about, env, names)
     found = Policy(planner, networks)
     task = jax.tree.map(lambda x: x[0], robot.tasks.params)
     try:
@@ -127,6 +133,30 @@ def of_file(path: Path, robot: Robot) -> Policy:
     if not fits:
         raise CheckpointError(f"{path} is a policy of another robot, or other tasks.")
     return found
+
+
+def _check_about(
+    path: Path, about: Mapping[str, Any], env: str, names: Sequence[str]
+) -> None:
+    """Refuses a policy that says it is of another robot, or of other tasks.
+
+    Robots of equal sizes have networks of equal shapes.
+    """
+    own, wanted = about.get("environment"), _called(env)
+    if own not in (None, wanted):
+        raise CheckpointError(f"{path} is a policy of {own}, not of {wanted}.")
+    learned = about.get("tasks")
+    if isinstance(learned, list) and not {*names} <= {*map(str, learned)}:
+        said, performed = ", ".join(map(str, learned)), ", ".join(names)
+        raise CheckpointError(
+            f"{path} is a policy of other tasks: it was learned on {said}, and "
+            f"{performed} are performed."
+        )
+
+
+def _called(env: str) -> str:
+    """Returns what a file of a policy calls a robot."""
+    return rundir.label(env) if user_files.is_file(env) else env
 
 
 def begun(parts: Parts, found: Policy) -> jaxpets.Planner:
@@ -170,11 +200,7 @@ def export(
       step: trials behind the model.
     """
     env, space = parts.robot.env, parts.robot.space
-    own = user_files.is_file(config.env)
-    about = {
-        "environment": rundir.label(config.env) if own else config.env,
-        "tasks": tasks.names,
-    }
+    about = {"environment": _called(config.env), "tasks": tasks.names}
     origin = {**model_file.origin(source), "distill": to_json(config.distill)}
     built: Any = {
         "obs_size": parts.model.obs_size,

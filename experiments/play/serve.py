@@ -79,7 +79,8 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     search = dataclasses.replace(found.search, horizon=horizon)
     rollout, _ = build.rollout_of(robot, found.size, search)
     file = options.policy or found.policy
-    policy = of_file(file, robot) if file else None
+    env, names = options.env or robot.name, robot.tasks.names
+    policy = of_file(file, robot, env, names) if file else None
     live = Live(
         robot, rollout, build.optimizer(search, robot.env), found.params,
         horizon=horizon, terminal_fn=build.imagined_end(robot.env), policy=policy,
@@ -88,7 +89,7 @@ def _live(server: viser.ViserServer, options: Options) -> tuple[Session, Page]:
     session = Session(live, commands.first)
     session.notice = "It compiles the planner: some seconds, once on this machine."
     page = Page(
-        server, robot, options.env or robot.name, session, found.title, commands,
+        server, robot, env, session, found.title, commands,
         lambda panel: PlanPart(panel, commands, horizon, has_policy=policy is not None),
     )  # fmt: skip
     return session, page

@@ -24,7 +24,7 @@ from experiments.play.live import Live
 from experiments.play.session import Session
 
 
-def saved(robot, model, params, path, *, goals=None):
+def saved(robot, model, params, path, *, goals=None, about=None):
     """Writes a policy that has learned nothing."""
     env = robot.env
     box = {"action_low": env.action_low, "action_high": env.action_high}
@@ -42,8 +42,14 @@ def saved(robot, model, params, path, *, goals=None):
         tasks = jax.tree.map(lambda x: x[0], tasks)
     known = jaxpets.PlanParams(params, tasks)
     state = jax.jit(learner.init)(known, jax.random.key(0), data)
-    save_policy(path, params=state.params, space=robot.space, obs_size=18, **box)
+    save_policy(
+        path, params=state.params, space=robot.space, obs_size=18, about=about, **box
+    )
     return path
+
+
+def of_file(path, robot):
+    return policy.of_file(path, robot, robot.name, robot.tasks.names)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +60,7 @@ def cheetah():
 @pytest.fixture(scope="module")
 def found(cheetah, tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "policy-0.safetensors"
-    return policy.of_file(saved(*cheetah, path), cheetah[0])
+    return of_file(saved(*cheetah, path), cheetah[0])
 
 
 @pytest.fixture(scope="module")
@@ -117,25 +123,56 @@ def test_a_model_that_came_along_brings_its_policy(cheetah, monkeypatch):
     robot = cheetah[0]
     monkeypatch.setattr(robots, "named", lambda *_: robot)
     assert source.found("pretrained/best", env="own.py").policy is None
-    own = policy.of_file(policies.path("best"), robot)
+    own = of_file(policies.path("best"), robot)
     for said in ("pretrained/best", "pretrained"):  # there is no other
-        found = policy.of_file(Path(said), robot)
+        found = of_file(Path(said), robot)
         np.testing.assert_array_equal(found.networks.mean, own.networks.mean)
     with pytest.raises(UsageError, match="--policy pretrained/bst is not valid; name"):
-        policy.of_file(Path("pretrained/bst"), robot)
+        of_file(Path("pretrained/bst"), robot)
 
 
 def test_a_file_that_is_no_policy_of_the_robot_is_refused(cheetah, tmp_path):
     robot = cheetah[0]
     with pytest.raises(UsageError, match=r"--policy .* there is no such file"):
-        policy.of_file(tmp_path / "none.safetensors", robot)
+        of_file(tmp_path / "none.safetensors", robot)
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes(b"x")
     with pytest.raises(CheckpointError, match=r"bad\.safetensors"):
-        policy.of_file(bad, robot)
+        of_file(bad, robot)
     one = saved(*cheetah, tmp_path / "one.safetensors", goals=Goals())
     with pytest.raises(CheckpointError, match="of another robot, or other tasks"):
-        policy.of_file(one, robot)
+        of_file(one, robot)
     walker = envs.make("dmc/walker", backend="mujoco")
     with pytest.raises(CheckpointError):
-        policy.of_file(one, walker)
+        of_file(one, walker)
+
+
+@pytest.mark.parametrize(
+    ("about", "words"),
+    [
+        (
+            {"environment": "gym/Walker2d-v5"},
+            "a policy of gym/Walker2d-v5, not of pets",
+        ),
+        ({"environment": 3}, "a policy of 3, not of pets"),
+        (
+            {"tasks": ["forward"]},
+            "it was learned on forward, and forward, backward, fr",
+        ),
+        ({"tasks": [[1]]}, "learned on [1], and"),
+    ],
+)
+def test_a_policy_that_fits_may_be_of_another_robot(cheetah, tmp_path, about, words):
+    """Or of other tasks: HalfCheetah and Walker2d of gym have the same shapes."""
+    path = saved(*cheetah, tmp_path / "other.safetensors", about=about)
+    with pytest.raises(CheckpointError) as refused:
+        of_file(path, cheetah[0])
+    assert f"{path} is a policy of " in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_a_policy_is_of_the_tasks_that_are_performed(cheetah, tmp_path):
+    about = {"environment": "cart-robot", "tasks": ["forward", "front-flip"]}
+    path = saved(*cheetah, tmp_path / "own.safetensors", about=about)
+    # A robot of a file is called as the file is.
+    assert policy.of_file(path, cheetah[0], "runs/cart.py:robot", ["front-flip"])

@@ -297,7 +297,7 @@ def test_a_policy_that_will_not_do_is_refused_before_work_begins(
     for source, path, words in (
         ("best", "none.safetensors", "--policy none.safetensors is not valid"),
         ("best", "pretrained/bst", "best"),
-        ("dmc/walker", "pretrained/best", "another robot"),
+        ("dmc/walker", "pretrained/best", "policy of pets/half_cheetah, not of dmc/wa"),
     ):
         assert zero_shot(f"pretrained/{source}", tmp_path, "--policy", path) != 0
         assert words in capsys.readouterr().err.splitlines()[-1]
