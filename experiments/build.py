@@ -205,6 +205,7 @@ def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
         num_members=model.num_members,
         hidden_sizes=(model.hidden_size,) * model.num_layers,
         state_margin=model.state_margin,
+        activation=model.activation,
     )
 
 

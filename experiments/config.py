@@ -70,6 +70,8 @@ class ModelConfig:
         EnsembleConfig.hidden_sizes
     )
     """Hidden layers."""
+    activation: Annotated[Literal["swish", "tanh", "relu", "gelu"], EXPLORED] = "swish"
+    """Of the hidden layers."""
     state_margin: Annotated[float, Meta(ge=0.0, le=1e6)] | None = (
         EnsembleConfig.state_margin
     )

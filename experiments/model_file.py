@@ -6,9 +6,9 @@ performs, but there are no data to learn on.
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import jax
 import msgspec
@@ -155,11 +155,26 @@ def check_fits(model: Model, robot: Any, said: str) -> None:
     Raises:
       UsageError: if its sizes or its entries are not those of the robot.
     """
-    sizes = (model.ensemble.obs_size, model.ensemble.action_size)
-    own = model.ensemble.space.coordinates if model.ensemble.space else ()
-    if sizes != robots.sizes(robot) or (own and own != robot.space.coordinates):
-        valid = f"{said} is of another robot"
-        raise UsageError(f"--env {robot.name} is not valid; {valid}.")
+    space = model.ensemble.space
+    assert space is not None
+    found = (model.ensemble.obs_size, model.ensemble.action_size)
+    wanted = robots.sizes(robot)
+    own, its = space.coordinates, robot.space.coordinates
+    same = own == its and (own or space == robot.space)
+    if found == wanted and same:
+        return
+    why = f"it has observations and actions of {found}, and the robot of {wanted}"
+    if found == wanted:
+        alone, lacking = _besides(own, its), _besides(its, own)
+        why = "the coordinates must be the same in the same order; "
+        why += f"only the file has {alone}, only the robot has {lacking}"
+    valid = f"{said} is of another robot: {why}"
+    raise UsageError(f"--env {robot.name} is not valid; {valid}.")
+
+
+def _besides(rows: Sequence[Any], others: Sequence[Any]) -> str:
+    """Returns which coordinates there are besides others."""
+    return ", ".join(x.name for x in rows if x not in others) or "none"
 
 
 def search_of(model: Model, said: str) -> PlannerConfig:
@@ -245,10 +260,13 @@ def _arm_of(model: Model, given: str) -> str:
 
 
 def _sizes(model: Model, said: str) -> ModelConfig:
-    """Returns the sizes of an ensemble whose hidden layers are equal."""
+    """Returns the network of an ensemble whose hidden layers are equal."""
     config = model.ensemble.config
     assert config is not None
     widths = config.hidden_sizes
     if len({*widths}) > 1:
         raise UsageError(f"{said} has hidden layers of several widths: {widths}.")
-    return ModelConfig(config.num_members, widths[0], len(widths), config.state_margin)
+    return ModelConfig(
+        config.num_members, widths[0], len(widths), cast(Any, config.activation),
+        config.state_margin,
+    )  # fmt: skip

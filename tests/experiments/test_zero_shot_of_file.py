@@ -12,7 +12,7 @@ import runs
 
 import jaxpets
 from experiments import cli, exploration, model_file
-from experiments.build import build
+from experiments.build import build, ensemble_config
 from experiments.config import Config
 from experiments.entries import to_json
 from experiments.errors import UsageError
@@ -20,7 +20,7 @@ from experiments.presets import PRESETS
 from experiments.run import main
 from experiments.storage.folder import RunFolder
 from experiments.tools import share
-from jaxpets import models
+from jaxpets import coordinates, models
 
 SMALL = (
     "--task", "front-flip", "--engine", "mujoco", "--eval-trials", "1",
@@ -191,6 +191,46 @@ def test_layers_of_several_widths_are_refused(tmp_path, capsys):
     jaxpets.save_model(path, model, params, about={"environment": env.name})
     assert zero_shot(path, tmp_path / "out") == 2
     assert "has hidden layers of several widths: (4, 8)" in capsys.readouterr().err
+
+
+def network(path, space, **config):
+    """Writes a model of HalfCheetah's sizes that has learned nothing."""
+    sizes = jaxpets.EnsembleConfig(num_members=3, hidden_sizes=(4, 4), **config)
+    model = jaxpets.ensemble(sizes, space, obs_size=18, action_size=6)
+    params = jax.jit(model.init)(jax.random.key(0))
+    about = {"environment": "pets/half_cheetah"}
+    jaxpets.save_model(path, model, params, about=about)
+    return model
+
+
+def test_a_model_plans_with_its_own_activation(tmp_path, capsys):
+    robot = jaxpets.envs.make("pets/half_cheetah", backend="mujoco")
+    path = tmp_path / "m.safetensors"
+    model = network(path, robot.space, activation="tanh")
+    command = ["zero-shot", "--from", str(path), "--task-planner.num-particles", "3"]
+    config = cli.parse(command)
+    assert ensemble_config(config.model).activation == "tanh"
+    assert model.config.activation == "tanh"
+    assert main([*command, "--model.activation", "relu"]) == 2
+    assert "it must be tanh, as in the exploration run" in capsys.readouterr().err
+
+
+def test_a_model_in_other_coordinates_than_the_robots_is_refused(tmp_path, capsys):
+    """The features of the plain space are 18 here, as those of the robot."""
+    robot = jaxpets.envs.make("pets/half_cheetah", backend="mujoco")
+    path = tmp_path / "m.safetensors"
+    for space, words in (
+        (jaxpets.delta_space(), "none, only the robot has mean_qvel/rootx, qpos/ro"),
+        (
+            coordinates.space(robot.space.coordinates[::-1]),
+            "none, only the robot has none",
+        ),
+    ):
+        network(path, space)
+        assert zero_shot(path, tmp_path / "out") == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert f"{path} is of another robot: the coordinates must be the" in said
+        assert f"only the file has {words}" in said
 
 
 def test_a_text_file_is_an_error(tmp_path, capsys):
