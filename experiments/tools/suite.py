@@ -239,13 +239,13 @@ def _trial_steps(config: Mapping[str, Any]) -> int:
 
 
 def numbers(scores: Mapping[int, float], steps: int) -> dict[str, Any]:
-    """Returns mean, interval and each seed's mean; `steps` are of exploration."""
+    """Returns mean, interval, each seed's mean or None; `steps` are of exploration."""
     summary = stats.summarize(np.array(list(scores.values()), float))
     interval = summary.ci95 if summary else None
     return {
         "mean": round(summary.mean, 1) if summary else None,
         "interval": [round(x, 1) for x in interval] if interval else None,
-        "seeds": {str(seed): round(score, 1) for seed, score in scores.items()},
+        "seeds": rundir.plain({seed: round(x, 1) for seed, x in scores.items()}),
         "steps": steps,
     }
 
@@ -265,14 +265,14 @@ def cell(found: Mapping[str, Any] | None) -> str:
 def _mean(found: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
     """Returns the mean of tasks, and of how many if some are missing.
 
-    With an interval over seeds if all tasks have the same: a seed's mean is one number.
+    With an interval over seeds if tasks have the same; not finite if a task's is not.
     """
     own = [found[name] for name in names if name in found]
     if not own:
         return "-"
-    mean = statistics.mean(x["mean"] for x in own)
-    interval = stats.t_interval(_of_seeds(own))
-    text = cell({"mean": mean, "interval": interval})
+    means = [x["mean"] for x in own]
+    mean = None if None in means else statistics.mean(means)
+    text = cell({"mean": mean, "interval": stats.t_interval(_of_seeds(own))})
     return text if len(own) == len(names) else f"{text} (of {len(own)})"
 
 
@@ -289,8 +289,8 @@ def _less(
 
 
 def _of_seeds(own: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """Returns each seed's mean of tasks, `[S]`; of none if tasks have other seeds."""
-    seeds = {frozenset(x["seeds"]) for x in own}
+    """Returns each finite seed's mean of tasks, `[S]`; of none if tasks have others."""
+    seeds = {frozenset(y for y, z in x["seeds"].items() if z is not None) for x in own}
     same = sorted(seeds.pop()) if len(seeds) == 1 else []
     return np.array([statistics.mean(x["seeds"][y] for x in own) for y in same], float)
 

@@ -80,6 +80,6 @@ def _seeds(
         if numbers is None or numbers["mean"] is None:
             continue
         paint = style.arm_color(arm, list(found))
-        seeds = [x for x in numbers["seeds"].values() if np.isfinite(x)]
+        seeds = [x for x in numbers["seeds"].values() if x is not None]
         axes.plot(seeds, [height] * len(seeds), "|", color=paint, alpha=0.5)
         axes.plot([numbers["mean"]], [height], "o", color=paint, markersize=5)

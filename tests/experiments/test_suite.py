@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from small_logs import write_run
 
+from experiments.storage import rundir
 from experiments.tools import suite
 
 PEERS_FILE = Path(__file__).parents[2] / suite.PEERS
@@ -103,6 +104,35 @@ def test_arms_are_compared_on_the_tasks_that_all_have(tmp_path, peers, capsys):
     assert "| the other domains (of 1) | 150 [-223, 523] | 150 [-223, 523] |" in text
     assert suite.main([*flags, "--than", "oracle"]) == 2
     assert "oracle: it is none of best, random, opax" in capsys.readouterr().err
+
+
+def test_what_is_not_finite_is_said(tmp_path, peers, capsys):
+    """By what was read from logs as by the file of it."""
+    nan = float("nan")
+    tasks = {
+        "cheetah/run": {0: 500.0, 1: 700.0, 2: nan},
+        "finger/spin": {0: 100.0, 1: 300.0, 2: nan},
+        "hopper/hop": {0: nan, 1: 9.0, 2: 9.0},
+        "walker/run": {0: nan, 1: nan, 2: nan},
+    }
+    all_of = {name: suite.numbers(seeds, 4000) for name, seeds in tasks.items()}
+    whole = {name: all_of[name] for name in ("cheetah/run", "finger/spin")}
+    uneven = whole | {"hopper/hop": all_of["hopper/hop"]}
+    path, figure = tmp_path / "results.json", tmp_path / "tasks.svg"
+    for own, mean in (
+        (whole, "400 [-871, 1671] (of 2)"),  # of the seeds 0 and 1
+        (uneven, "270 (of 3)"),  # whose seeds are not the same
+        (all_of, "not finite (of 4)"),
+    ):
+        rundir.write_json(path, {"best": own, "random": own})
+        flags = [str(path), "--peers", peers, "--figure", str(figure)]
+        assert suite.main([*flags, "--than", "random"]) == 0
+        text = capsys.readouterr().out
+        assert f"| **mean** | {mean} | {mean} |" in text and "nan" not in text
+        for found in ({"best": own}, suite.read(path)):
+            assert suite._mean(found["best"], suite.NAMES) == mean
+    assert "| walker/run | not finite | - |" in text
+    assert suite._less(all_of, all_of, ["cheetah/run"]).startswith("0 [")
 
 
 def test_a_variant_is_asked_for(runs, tmp_path, peers, capsys):
