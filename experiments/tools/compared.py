@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 import jaxpets
 
@@ -138,6 +139,12 @@ def score_all(
 def joined(found: Sequence[Explored]) -> jaxpets.Transition:
     """Returns the draws of all runs, `[N, B, ...]`."""
     return jax.tree.map(lambda *x: jnp.concatenate(x), *(run.data for run in found))
+
+
+def scale_of(values: Array) -> Array:
+    """Returns the std `[D]` of values `[..., D]`; 1 for what stays as it is."""
+    std = jnp.std(values, axis=tuple(range(values.ndim - 1)))
+    return jnp.where(std < 1e-6, 1.0, std)
 
 
 def arms_of(found: Sequence[Explored]) -> list[str]:

@@ -7,7 +7,8 @@ arm. Means over pairs of a model and a data set are written by the arms of both;
 no pair.
 
 error: of the members' mean prediction of the next observation, root mean square over
-  transitions and dimensions, each by its target's std in all that was drawn.
+  transitions and dimensions, each by its target's std in all that was drawn; by 1 where
+  that never changed.
 nll: negative log-likelihood in nats per dimension of the equal mixture of the members,
   over dimensions jointly, by their number.
 Targets are what the model of the robot predicts: changes, of most entries.
@@ -61,7 +62,7 @@ def measure(
 
     found = compared.read(runs, at_trial, env, transitions)
     data, space = compared.joined(found), robots.of(found[0].config).space
-    scale = jnp.std(space.target(data.obs, data.next_obs), axis=(0, 1))
+    scale = compared.scale_of(space.target(data.obs, data.next_obs))
     error, nll = compared.score_all(found, _score_of, data, scale)
     arms = compared.arms_of(found)
     return {

@@ -103,7 +103,7 @@ def measure(
         return score(model.sample, model.num_members, steps, params, data, scale)
 
     data = compared.joined(found)
-    scores = compared.score_all(found, score_of, data, scale_of(data.obs))
+    scores = compared.score_all(found, score_of, data, compared.scale_of(data.obs))
     arms = compared.arms_of(found)
     every: dict[str, Any] = {}
     own: dict[str, Any] = {}
@@ -117,12 +117,6 @@ def measure(
                     at_step[name] = entry
     heading = {**compared.heading(found, num_rows), "steps": num_steps}
     return heading | {"arms": every, "own": own}
-
-
-def scale_of(obs: Array) -> Array:
-    """Returns the std `[D]` of observations `[..., D]`; 1 for what stays as it is."""
-    std = jnp.std(obs, axis=tuple(range(obs.ndim - 1)))
-    return jnp.where(std < 1e-6, 1.0, std)
 
 
 def score(

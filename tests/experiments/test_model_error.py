@@ -15,9 +15,10 @@ import jaxpets
 from benchmarks import model_quality
 from experiments import cli
 from experiments.build import build
+from experiments.config import Config
 from experiments.errors import UsageError
 from experiments.run import main
-from experiments.tools import model_error
+from experiments.tools import compared, model_error
 from jaxpets.envs import half_cheetah
 
 D, A = half_cheetah.OBS_SIZE, half_cheetah.ACTION_SIZE
@@ -108,6 +109,23 @@ def test_score_is_the_same_jitted():
     # XLA sums in another order.
     for one, other in zip(plain, jitted(params, data, scale), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5)
+
+
+def test_what_never_changes_divides_nothing(monkeypatch):
+    """As a goal that is seen and the same in all trials."""
+    data = transitions(2, 20)
+    still = [x.at[..., 0].set(3.0) for x in (data.obs, data.next_obs)]
+    data = data._replace(obs=still[0], next_obs=still[1])
+
+    def predict(params, obs, action):
+        return obs + params[:, None], jnp.ones_like(obs)
+
+    model = SimpleNamespace(predict=predict, num_members=3)
+    config = Config(seeds=(0, 1))
+    run = compared.Explored(config, "best", model, normal(2, 3, D), data, 4)
+    monkeypatch.setattr(compared, "read", lambda *_: [run])
+    found = model_error.measure([], 20, None)
+    assert np.isfinite(found["error"]["best"]["best"]["mean"])
 
 
 # The pairs.

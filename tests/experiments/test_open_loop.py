@@ -11,7 +11,7 @@ import runs
 import jaxpets
 from experiments.errors import UsageError
 from experiments.run import main
-from experiments.tools import open_loop
+from experiments.tools import compared, open_loop
 
 K = 10  # transitions of a window
 STEPS = [1, 3, K]
@@ -128,7 +128,7 @@ def test_a_median_that_is_infinite_or_has_infinite_neighbours():
 def test_score_is_the_same_for_all_sizes_of_chunks_and_jitted(monkeypatch):
     data = world(5, 10, NOISE)
     params = models([0.0, 0.1], [NOISE, NOISE])
-    scale = open_loop.scale_of(data.obs)
+    scale = compared.scale_of(data.obs)
     plain = open_loop.score(walk, 2, STEPS, params, data, scale)
 
     def score(*inputs):
@@ -146,7 +146,7 @@ def test_score_is_the_same_for_all_sizes_of_chunks_and_jitted(monkeypatch):
 def test_a_dimension_that_stays_as_it_is_has_scale_one():
     obs = jnp.stack([jnp.arange(6.0), jnp.full(6, 3.0)], axis=-1).reshape(2, 3, 2)
     # A sum of six numbers in float32.
-    np.testing.assert_allclose(open_loop.scale_of(obs), [np.std(np.arange(6)), 1], 1e-6)
+    np.testing.assert_allclose(compared.scale_of(obs), [np.std(np.arange(6)), 1], 1e-6)
 
 
 # The pairs.
