@@ -87,14 +87,19 @@ def jobs(sweep: Sweep) -> Iterator[Job]:
 def _variants(later: Flags) -> Iterator[Flags]:
     """Returns a later phase once for each combination of what it varies, if anything.
 
-    What its values say goes into the tag, so that each has a folder of its own.
+    What its values say goes into the tag, so that each has a folder of its own. A task
+    alone would be no tag: its folder could be that of the phase which performs it.
     """
     flags = dict(later)
     vary = _table("vary", flags)
     for values in itertools.product(*vary.values()):
         chosen = dict(zip(vary, values, strict=True))
-        words = [str(x) for x in (flags.get("tag"), *map(_words, values)) if x]
-        yield flags | chosen | ({"tag": "-".join(words)} if vary else {})
+        given = [str(flags["tag"])] if flags.get("tag") else []
+        words = [rundir.label(_words(value)) for value in values]
+        if not given and list(vary) == ["task"]:
+            given = ["task"]
+        tag = "-".join(filter(None, [*given, *words]))
+        yield flags | chosen | ({"tag": tag} if vary else {})
 
 
 def _is_at(place: Mapping[str, Any], grid: Grid) -> bool:

@@ -101,6 +101,30 @@ def test_a_phase_is_varied_and_each_has_its_tag(file):
     assert "--task forward --pessimism 0.5 --tag 0.5" in last
 
 
+NAMED = """
+[[then]]
+phase = "zero-shot"
+vary.task = ["walk", "stand,walk", "all"]
+[[then]]
+phase = "zero-shot"
+tag = "s"
+vary.task = ["walk"]
+vary.policy = ["pretrained/best"]
+"""
+
+
+def test_a_tag_of_any_value_is_one_that_the_phase_takes(file, tmp_path, monkeypatch):
+    """Neither a task nor what no folder may be called."""
+    monkeypatch.chdir(tmp_path)
+    text = FILE.replace('"random", "pink-noise"', '"random"')
+    text = text.replace("[flags]", '[flags]\nenv = "dmc/walker"')
+    (job,) = grid.jobs(grid.read(file(text + NAMED)))
+    explored = cli.parse(job.commands[0])
+    tags = [cli.parse(command, explored).tag for command in job.commands[1:]]
+    wanted = ["task-walk", "task-stand-walk", "task-all", "s-walk-pretrained-best"]
+    assert tags == wanted
+
+
 @pytest.mark.parametrize("name", ["dmc20", "study", "search"])
 def test_the_files_of_tables_are_valid(name, monkeypatch):
     """Flags and tags, of every run and phase; --list would read the robots as well."""
