@@ -253,6 +253,7 @@ def _one(
     length: int, bind: Bind,
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:  # fmt: skip
     """Returns `start` and `chunk` of one actor; the reward's data say where it acts."""
+    planner = _bound(planner, bind)
 
     def start(data: Any, key: Array) -> jaxpets.typing.UnrollState:
         return jaxpets.start_trial(env_of(data), planner, key)
@@ -261,10 +262,24 @@ def _one(
         params: jaxpets.PlanParams, key: Array, state: jaxpets.typing.UnrollState
     ) -> tuple[jaxpets.typing.UnrollState, jaxpets.Transition, Array]:
         env = env_of(params.reward)
-        params = params._replace(reward=bind(params.reward, state.env.constants))
         state, transitions, plans = jaxpets.unroll(
-            env, planner, params, key, state, length=length
+            env, planner, params, key, state, length=length, observe_fn=lambda x: x
         )
         return state, transitions, plans.value / horizon
 
     return start, chunk
+
+
+def _bound(planner: jaxpets.Planner, bind: Bind) -> jaxpets.Planner:
+    """Returns a planner of an EnvState, with whose constants it binds its reward data.
+
+    A trial may end within a chunk, and the next one has constants of its own.
+    """
+
+    def step(
+        params: jaxpets.PlanParams, key: Array, state: Any, env: jaxpets.EnvState
+    ) -> tuple[jaxpets.typing.PlanOutput, Any]:
+        data = bind(params.reward, env.constants)
+        return planner.step(params._replace(reward=data), key, state, env.obs)
+
+    return planner._replace(step=step)
