@@ -106,7 +106,9 @@ def of(
       UsageError: if the value of a flag is not valid.
       SystemExit: after `--help`.
     """
-    shown = default if command is None else _without_unread(default, command)
+    shown = default
+    if command is not None and {"-h", "--help"} & set(argv):
+        shown = _without_unread(default, command)
     found, rest = tyro.cli(
         type(shown),
         args=list(argv),
@@ -122,7 +124,7 @@ def of(
 def _without_unread(default: T, phase: str) -> T:
     """Returns defaults whose `--help` leaves out what a phase does not read.
 
-    Such flags are still taken, to be refused by name.
+    It does not take such flags, either, which are to be refused by name.
     """
     hidden = [
         (name, Annotated[hint, tyro.conf.Suppress], getattr(default, name))
