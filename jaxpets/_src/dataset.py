@@ -1,5 +1,6 @@
 """A dataset of fixed capacity, so that it grows without a retrace."""
 
+import functools
 from typing import Any
 
 import jax
@@ -92,8 +93,12 @@ def num_stable(transitions: Transition) -> Array:
     3
     """
     check_record("transitions", transitions, Transition)
-    obs, action, next_obs = (jnp.max(jnp.abs(x), axis=-1) for x in transitions)
-    is_good = (obs <= _MAX_SIZE) & (action <= _MAX_SIZE) & (next_obs <= _MAX_SIZE)
+    # Number by number: XLA's maximum of many rows on a CPU passes over what is NaN.
+    good = (jnp.all(jnp.abs(x) <= _MAX_SIZE, axis=-1) for x in transitions)
+    is_good = functools.reduce(jnp.logical_and, good)
+    obs, next_obs = (
+        jnp.max(jnp.abs(x), axis=-1) for x in (transitions.obs, transitions.next_obs)
+    )
     step = jnp.arange(is_good.shape[-1], dtype=jnp.int32)
     is_before = jax.lax.cummin(is_good.astype(jnp.int32), axis=is_good.ndim - 1) > 0
     # At the start of a trial, from rest, everything grows.

@@ -98,6 +98,14 @@ def test_what_comes_after_physics_diverged_is_no_data():
     assert found.tolist() == [[5] + [3] * 9, [5] + [1] * 9]
 
 
+@pytest.mark.parametrize("name", Transition._fields)
+def test_one_number_that_is_nan_is_found_in_many_rows(name):
+    """XLA's maximum of so many rows on a CPU is that of their other numbers."""
+    rows = Transition(*(np.ones((1000, size), np.float32) for size in (18, 6, 18)))
+    getattr(rows, name)[700, 1] = np.nan
+    assert num_stable(rows) == 700
+
+
 def test_what_blew_up_to_there_is_no_data_either():
     path = np.float32([0, 1, 4, 6, 13, 80, 70, 150, np.inf])[:, None]
     rows = Transition(path[:-1], 0 * path[:-1], path[1:])
