@@ -127,15 +127,29 @@ def append_stable(dataset: Dataset, transitions: Transition) -> Dataset:
     known = append(dataset, transitions, kept)
     step = jnp.arange(length, dtype=jnp.int32)
     num_lost = jnp.maximum(length - kept, 1)
-    each, rest = jnp.divmod(known.size, num_lost)  # a product of two sizes is too large
+    each, rest = jnp.divmod(known.size, num_lost)
     lost = jnp.maximum(step - kept, 0)
-    again = lost * each + lost * rest // num_lost
+    again = lost * each + _share(lost, rest, num_lost)
     # Beyond the last row nothing is written.
     places = (dataset.cursor + step) % capacity
     places = jnp.where(step < kept, capacity, places)
     data = Transition(*(rows.at[places].set(rows[again]) for rows in known.data))
     size = jnp.minimum(dataset.size + length, capacity)
     return Dataset(data, size, (dataset.cursor + length) % capacity)
+
+
+def _share(count: Array, part: Array, whole: Array) -> Array:
+    """Returns `count * part // whole`, for count and part below a whole of up to 2^25.
+
+    The product itself does not fit into int32 from 46,341 squared on, so it is divided
+    digit by digit, in base 32, and what remains is carried on.
+    """
+    share, rest = jnp.zeros_like(count), jnp.zeros_like(count)
+    for shift in (20, 15, 10, 5, 0):
+        digit = (count >> shift) & 31
+        more, rest = jnp.divmod(32 * rest + digit * part, whole)
+        share = 32 * share + more
+    return share
 
 
 def _check_rows(dataset: Dataset, transitions: Transition) -> None:

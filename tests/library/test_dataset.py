@@ -137,6 +137,21 @@ def test_rows_that_are_there_take_the_places_of_those_that_are_lost():
     assert many.size == CAPACITY and many.cursor == 1
 
 
+def test_a_long_trial_that_diverged_leaves_no_rows_of_zeros():
+    """The product of two of its numbers of rows does not fit into int32."""
+    known, length = 60_000, 100_000
+    filled = append(jaxpets.datasets.init(200_000, 2, 1), numbered(1, known))
+    rows = numbered(known + 1, length)
+    rows = rows._replace(next_obs=rows.next_obs.at[10].set(jnp.nan))
+    after = jax.jit(append_stable)(filled, rows)
+    assert after.size == known + length
+    again = np.asarray(after.data.obs)[known + 10 : known + length, 0]
+    rows_known, num_lost = known + 10, length - 10
+    np.testing.assert_array_equal(
+        again, 1 + np.arange(num_lost, dtype=np.int64) * rows_known // num_lost
+    )
+
+
 @pytest.mark.parametrize("count", [0, 5, 8, 11])
 def test_growing_keeps_every_row_and_the_oldest_goes_first(count):
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
