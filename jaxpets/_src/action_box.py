@@ -46,7 +46,7 @@ def action_box(action_low: ArrayLike, action_high: ArrayLike) -> ActionBox:
       action_high: `[A]`, above action_low in every entry.
 
     Raises:
-      TypeError, ValueError: for bounds that are no box.
+      TypeError, ValueError: for bounds that are no box, also of float32.
     """
     _check(action_low, action_high)
     low = jnp.asarray(action_low, jnp.float32)
@@ -71,9 +71,15 @@ def _check(action_low: ArrayLike, action_high: ArrayLike) -> None:
         )
     if any(isinstance(bound, Tracer) for bound in bounds):
         return
-    low, high = np.asarray(action_low), np.asarray(action_high)
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+    # What is searched is a box of float32, whose half width is squared: that may be
+    # infinite or zero where the bounds, as they came, are neither.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        low, high = (np.asarray(bound).astype(np.float32) for bound in bounds)
+        square = ((high - low) / 2) ** 2
+    is_box = (low < high) & np.isfinite(square) & (square >= np.finfo(np.float32).tiny)
+    if not is_box.all():
         raise ValueError(
-            "action_low and action_high must be finite with low < high, "
-            f"got {low.tolist()} and {high.tolist()}."
+            "action_low and action_high must be finite with low < high, and in float32 "
+            "so must be the square of their difference, above 0, got "
+            f"{np.asarray(action_low).tolist()} and {np.asarray(action_high).tolist()}."
         )

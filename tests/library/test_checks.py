@@ -141,6 +141,22 @@ def test_action_box_refuses_what_cannot_be_searched(name):
         action_box(low, high)
 
 
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([-3.4e38], [3.4e38]),  # the width is infinite
+        ([-1e300], [1e300]),
+        ([-1e20], [1e20]),  # its square is
+        ([-1.0, 1.0], [1.0, 1.0 + 1e-9]),  # one number
+        ([-1e-25], [1e-25]),
+    ],
+)
+def test_action_box_refuses_what_is_no_box_of_float32(low, high):
+    message = r"action_low and action_high .* in float32 .*, got .* and "
+    with pytest.raises(ValueError, match=message):
+        action_box(np.array(low), np.array(high))
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.int32])
 def test_an_action_box_is_float32_whatever_its_bounds_are(dtype):
     box = action_box(-np.ones(2, dtype), np.full(2, 3, dtype))
