@@ -19,6 +19,7 @@ from jaxpets._src.actor_critic_records import (
     Goals,
 )
 from jaxpets._src.actor_critic_update import build_update
+from jaxpets._src.check_space import check_space_size
 from jaxpets._src.checks import (
     check_count,
     check_record,
@@ -93,11 +94,12 @@ def actor_critic(
       arguments of another kind or shape.
 
     Raises:
-      TypeError, ValueError: if an argument is not what it should be.
+      TypeError, ValueError: if an argument is not what it should be, or space has
+        another size than obs_size.
     """
     check_optimizer(optimizer)
     check_record("config", config, ActorCriticConfig)
-    check_count("obs_size", obs_size)
+    check_space_size(space, obs_size)
     check_count("num_members", num_members)
     box = action_box(action_low, action_high)
     networks = build_networks(config.hidden_size, space, goals, box)

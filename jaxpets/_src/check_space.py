@@ -1,10 +1,12 @@
-"""The law of a ModelSpace, tried on data."""
+"""The law of a ModelSpace, tried on data, and its size."""
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_record
+from jaxpets._src.checks import check_array, check_count, check_record
 from jaxpets._src.types import ModelSpace
 
 
@@ -53,3 +55,16 @@ def check_space(
             "space.next_obs(obs, space.target(obs, next_obs)) must be next_obs, but "
             f"entry {worst} is off by up to {error[worst]:.3g}."
         )
+
+
+def check_space_size(space: Any, obs_size: Any) -> None:
+    """Raises unless this is a space of observations of this size.
+
+    A table of one row would be taken for all entries, and one of fewer would leave
+    entries out, without a word. A space of functions of your own cannot say its size.
+    """
+    check_record("space", space, ModelSpace)
+    check_count("obs_size", obs_size)
+    size = len(space.coordinates)
+    if size not in (0, obs_size):
+        raise ValueError(f"obs_size must be {size} as of space, got {obs_size}.")

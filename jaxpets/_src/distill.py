@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxpets._src.action_box import action_box
 from jaxpets._src.actor_critic_networks import build_networks, guided_reward
 from jaxpets._src.actor_critic_records import Goals
+from jaxpets._src.check_space import check_space_size
 from jaxpets._src.checks import check_callable, check_count, check_record
 from jaxpets._src.distill_records import (
     DistillConfig,
@@ -100,11 +101,12 @@ def distill(
       arguments of another kind or shape.
 
     Raises:
-      TypeError, ValueError: if an argument is not what it should be.
+      TypeError, ValueError: if an argument is not what it should be, or space has
+        another size than obs_size.
     """
     check_optimizer(optimizer)
     check_record("config", config, DistillConfig)
-    check_count("obs_size", obs_size)
+    check_space_size(space, obs_size)
     check_count("num_members", num_members)
     box = action_box(action_low, action_high)
     networks = build_networks(config.hidden_size, space, goals, box)

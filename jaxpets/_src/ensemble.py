@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.check_space import check_space_size
 from jaxpets._src.checks import (
     check_array,
     check_count,
@@ -126,11 +127,11 @@ def ensemble(
       An Ensemble.
 
     Raises:
-      TypeError, ValueError: when sizes do not fit; from the functions at trace time.
+      TypeError, ValueError: when sizes do not fit one another or the space; from the
+        functions at trace time.
     """
     check_record("config", config, EnsembleConfig)
-    check_record("space", space, ModelSpace)
-    check_count("obs_size", obs_size)
+    check_space_size(space, obs_size)
     check_count("action_size", action_size)
     feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
     input_size = feature_size + action_size

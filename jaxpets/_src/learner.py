@@ -121,8 +121,9 @@ def learner(
 
     Raises:
       TypeError, ValueError: if an argument is not what it should be, a trial does not
-        fit the capacity, or the model does not fit the environment; from `learn`, when
-        traced, if `refresh` changes a shape or dtype.
+        fit the capacity, or the model does not fit the environment in its sizes or in
+        the names of its entries; from `learn`, when traced, if `refresh` changes a
+        shape or dtype.
     """
     check_record("env", env, Env)
     check_record("ensemble", ensemble, Ensemble)
@@ -138,6 +139,7 @@ def learner(
             f"ensemble must have the sizes of env, obs_size {sizes[0]} and action_size "
             f"{sizes[1]}, got {ensemble.obs_size} and {ensemble.action_size}."
         )
+    _check_entries(env, ensemble)
 
     def init(key: Array) -> LearnerState:
         check_key("key", key)
@@ -166,6 +168,21 @@ def learner(
         return state, TrialOutput(transitions, plans, metrics)
 
     return Learner(init, learn, step)
+
+
+def _check_entries(env: Env, ensemble: Ensemble) -> None:
+    """Raises if both name the entries of an observation, but not alike.
+
+    Of what kind they are is not compared: a model may see them otherwise.
+    """
+    rows = () if ensemble.space is None else ensemble.space.coordinates
+    # Where one of them has no names there is nothing to compare.
+    for i, (wanted, row) in enumerate(zip(env.coordinates, rows, strict=False)):
+        if row.name != wanted.name:
+            raise ValueError(
+                "ensemble must be of the entries of env.coordinates, but entry "
+                f"{i} is {wanted.name!r} there and {row.name!r} in its space."
+            )
 
 
 def new_state(

@@ -13,6 +13,7 @@ from jaxpets._src import dataset, file_facts, tensor_file
 from jaxpets._src.action_box import ActionBox, action_box
 from jaxpets._src.actor_critic_networks import Networks, build_networks
 from jaxpets._src.actor_critic_records import ActorCriticParams, Goals
+from jaxpets._src.check_space import check_space_size
 from jaxpets._src.checks import check_count, check_like, check_record
 from jaxpets._src.types import ModelSpace, Planner
 
@@ -45,11 +46,11 @@ def save_policy(
         model, and "tasks".
 
     Raises:
-      TypeError, ValueError: if an argument is not what it should be, or has NaN.
+      TypeError, ValueError: if an argument is not what it should be, or has NaN, or
+        space has another size than obs_size.
     """
     check_record("params", params, ActorCriticParams)
-    check_record("space", space, ModelSpace)
-    check_count("obs_size", obs_size)
+    check_space_size(space, obs_size)
     box = action_box(action_low, action_high)
     kernel = params.actor["params"]["Dense_0"]["kernel"]  # [F + G, hidden]
     networks = build_networks(kernel.shape[-1], space, _NO_GOALS, box)
@@ -87,7 +88,7 @@ def load_policy(
     Raises:
       FileNotFoundError: if there is no such file.
       TypeError: if goals or space are something else.
-      ValueError: naming what is wrong with the file.
+      ValueError: naming what is wrong with the file, or if space has another size.
     """
     check_record("goals", goals, Goals)
     if space is not None:
@@ -104,6 +105,7 @@ def load_policy(
     except (TypeError, ValueError, OverflowError) as error:
         file_facts.refuse(file, str(error), error)
     space = space or file_facts.space_from_json(file, facts["space"], facts["obs_size"])
+    check_space_size(space, facts["obs_size"])
     first = file.shapes.get("actor.params.Dense_0.kernel", ())
     if len(first) != 2 or 0 in first:
         file_facts.refuse(file, f"its first layer must be of two axes, got {first}")

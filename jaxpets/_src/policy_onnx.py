@@ -9,7 +9,8 @@ from jax.typing import ArrayLike
 from jaxpets._src.action_box import action_box
 from jaxpets._src.actor_critic_networks import CLIP
 from jaxpets._src.actor_critic_records import ActorCriticParams
-from jaxpets._src.checks import check_array, check_count, check_record
+from jaxpets._src.check_space import check_space_size
+from jaxpets._src.checks import check_array, check_record
 from jaxpets._src.ensemble import delta_space
 from jaxpets._src.network import NORM_EPSILON
 from jaxpets._src.types import Coordinate, ModelSpace
@@ -64,8 +65,7 @@ def to_onnx(
       ImportError: without the package onnx.
     """
     check_record("params", params, ActorCriticParams)
-    check_record("space", space, ModelSpace)
-    check_count("obs_size", obs_size)
+    check_space_size(space, obs_size)
     box = action_box(action_low, action_high)
     read = _read(space, obs_size)
     mean, std = np.asarray(params.mean), np.asarray(params.std)
@@ -180,8 +180,6 @@ def _read(space: ModelSpace, obs_size: int) -> _Read:
         rows = tuple(Coordinate(str(i)) for i in range(obs_size))
     else:
         rows = space.coordinates
-    if len(rows) != obs_size:
-        raise ValueError(f"obs_size must be {len(rows)} as of space, got {obs_size}.")
     inputs = [i for i, row in enumerate(rows) if row.is_input]
     angles = [i for i in inputs if rows[i].kind == "angle"]
     turns = [i for i in inputs if rows[i].kind == "quaternion"][::4]

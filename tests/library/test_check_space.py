@@ -3,10 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 import toys
 
 import jaxpets
+from jaxpets import coordinates, policies
 from jaxpets.envs import half_cheetah as hc
 
 SPACE = jaxpets.delta_space()
@@ -92,3 +94,35 @@ def test_what_is_no_space_or_no_data_is_refused():
     with pytest.raises(ValueError, match=r"obs must be float32\[T, D\], got int32"):
         rows = np.zeros((3, 2), np.int32)
         jaxpets.check_space(SPACE, rows, rows)
+
+
+# -- its size ------------------------------------------------------------------------
+
+ONE = np.ones(1, np.float32)
+BOX = dict(action_low=-ONE, action_high=ONE)
+CHANCE = jaxpets.random_planner(-ONE, ONE)
+LEARNED = (toys.cart, toys.reach, optax.adam(1e-3))
+PARAMS = policies.ActorCriticParams(*[()] * 5)
+BUILD = {
+    "ensemble": lambda space, **sizes: jaxpets.ensemble(
+        jaxpets.EnsembleConfig(), space, action_size=1, **sizes
+    ),
+    "actor_critic": lambda space, **sizes: policies.actor_critic(
+        *LEARNED, policies.ActorCriticConfig(), space, **sizes, **BOX
+    ),
+    "distill": lambda space, **sizes: jaxpets.distill(
+        CHANCE, *LEARNED, policies.DistillConfig(), space, **sizes, **BOX
+    ),
+    "save_policy": lambda space, **sizes: policies.save_policy(
+        "none.safetensors", PARAMS, space, **sizes, **BOX
+    ),
+    "to_onnx": lambda space, **sizes: policies.to_onnx(PARAMS, space, **sizes, **BOX),
+}
+
+
+@pytest.mark.parametrize("name", BUILD)
+def test_a_space_is_of_the_observations(name):
+    """One of a single row would be taken for all entries, without a word."""
+    space = coordinates.space([coordinates.Coordinate("q")])
+    with pytest.raises(ValueError, match="obs_size must be 1 as of space, got 2"):
+        BUILD[name](space, obs_size=2)

@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +8,7 @@ import pytest
 import toys
 
 import jaxpets
-from jaxpets import FitConfig, RewardData
+from jaxpets import FitConfig, RewardData, coordinates
 
 ENV = toys.cart_env()
 MODEL = toys.small_ensemble()
@@ -173,3 +175,25 @@ def test_reward_data_that_change_shape_fail_when_traced(key):
                 CHANCE, key, INIT(key)._replace(reward=jnp.zeros(state.reward.shape))
             )
         )
+
+
+@pytest.mark.parametrize(("names", "other"), [("qw", True), ("qv", False)])
+def test_a_model_is_of_the_entries_of_the_environment(names, other):
+    """Of those of another robot of the same size it would learn all the same."""
+
+    def rows(names, kind="relative"):
+        return tuple(coordinates.Coordinate(name, kind) for name in names)
+
+    env = ENV._replace(coordinates=rows("qv"))
+    # In which kind a model sees an entry is its own affair.
+    space = coordinates.space(rows(names, "absolute"))
+    model = toys.small_ensemble(space=space)
+    learner = functools.partial(
+        jaxpets.learner, env, model, FITTER, trial_length=3, capacity=3
+    )
+    if not other:
+        learner()
+        return
+    message = "entries of env.coordinates, but entry 1 is 'v' there and 'w' in its"
+    with pytest.raises(ValueError, match=message):
+        learner()

@@ -11,7 +11,7 @@ from safetensors.numpy import load_file, save_file
 from test_policy_onnx import BOX, SPACES, policy_of
 
 import jaxpets
-from jaxpets import PlanParams, envs, policies
+from jaxpets import PlanParams, coordinates, envs, policies
 
 GOALS = policies.Goals(features=lambda target: jnp.stack([target, -target]))
 SPACE, SIZE = SPACES["turning"]
@@ -102,6 +102,12 @@ def test_a_strangers_file_is_refused(saved, tmp_path, changes, words):
     with pytest.raises(ValueError, match=words) as caught:
         policies.load_policy(path, goals=GOALS)
     assert str(path) in str(caught.value)
+
+
+def test_a_space_of_ones_own_has_the_size_of_the_file(saved):
+    space = coordinates.space([coordinates.Coordinate("q")])
+    with pytest.raises(ValueError, match="obs_size must be 1 as of space, got 12"):
+        policies.load_policy(saved, goals=GOALS, space=space)
 
 
 def test_a_model_is_no_policy():
