@@ -5,13 +5,14 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src import dataset as datasets
 from jaxpets._src.checks import check_count, check_keys, check_record
 from jaxpets._src.fit_records import FitMetrics
 from jaxpets._src.learner import Learner, LearnerState, TrialOutput
-from jaxpets._src.types import Planner, Transition
+from jaxpets._src.types import Dataset, Planner, Transition
 
 _MAPPED: Any = 0
 # The axes of a learner over seeds. All have seen equally much, so the size of their
@@ -38,7 +39,7 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
 
     Raises:
       TypeError, ValueError: unless num_seeds is a positive Python integer; from the
-        functions, unless there are as many keys.
+        functions, unless there are as many keys, states and transitions.
     """
     check_record("learner", learner, Learner)
     check_count("num_seeds", num_seeds)
@@ -51,9 +52,11 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
         one: Callable[..., tuple[LearnerState, Any]],
         keys: Array,
         state: LearnerState,
-        *rest: Any,
+        *rest: Transition,
     ) -> tuple[LearnerState, Any]:
         check_keys("keys", keys, num_seeds)
+        _check_state(state, num_seeds)
+        _check_seeds("transitions", rest[0] if rest else (), num_seeds)
         if num_seeds == 1:
             state, output = one(keys[0], _only(state), *_only(rest))
             return _as_one_of_many(state), _many(output)
@@ -71,6 +74,28 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
         return call(functools.partial(learner.step, planner), keys, state)
 
     return Learner(init, learn, step)
+
+
+def _check_state(state: Any, num_seeds: int) -> None:
+    """Raises unless all but what the seeds share is of so many."""
+    check_record("state", state, LearnerState)
+    check_record("state.dataset", state.dataset, Dataset)
+    own = state.dataset._replace(size=None, cursor=None)
+    _check_seeds("state", state._replace(dataset=own), num_seeds)
+
+
+def _check_seeds(name: str, tree: Any, num_seeds: int) -> None:
+    """Raises unless every leaf begins with an axis of so many seeds.
+
+    The programs of one seed would take the first of several, without a word.
+    """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        shape = jnp.shape(leaf)
+        if shape[:1] != (num_seeds,):
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} must have a first axis of "
+                f"{num_seeds} seeds, got the shape {shape}."
+            )
 
 
 def _only(tree: Any) -> Any:

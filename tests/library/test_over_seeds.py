@@ -142,6 +142,33 @@ def test_there_are_as_many_keys_as_seeds(num_seeds):
         seeds.init(keys_of(3)[0])
 
 
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_there_are_as_many_states_and_transitions_as_seeds(num_seeds):
+    """Of one seed's programs the first of several would be all that is left."""
+    seeds, keys = jaxpets.over_seeds(LEARNER, num_seeds), keys_of(num_seeds)[0]
+    state, others = (
+        jax.eval_shape(jaxpets.over_seeds(LEARNER, n).init, keys_of(n)[0])
+        for n in (num_seeds, 3)
+    )
+    rows = jax.tree.map(lambda x: np.stack([x] * 3), toys.transitions(LENGTH))
+    learn = functools.partial(jax.eval_shape, seeds.learn)
+    message = (
+        rf"state\.params.* must have a first axis of {num_seeds} seeds, got .*\(3,"
+    )
+    with pytest.raises(ValueError, match=message):
+        learn(keys, others, rows)
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(functools.partial(seeds.step, CHANCE), keys, others)
+    message = (
+        rf"transitions\.obs must have a first axis of {num_seeds} seeds, got .*\(3,"
+    )
+    with pytest.raises(ValueError, match=message):
+        learn(keys, state, rows)
+    shared = state._replace(reward=jax.ShapeDtypeStruct((), jnp.float32))
+    with pytest.raises(ValueError, match=r"state\.reward must .* got the shape \(\)"):
+        learn(keys, shared, rows)
+
+
 # -- buffers -------------------------------------------------------------------------
 
 
