@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_count, check_scalar
+from jaxpets._src.checks import check_count, check_scalar, keep_checked
 from jaxpets._src.types import Dataset, Planner, PlanParams, RewardFn
 
 
@@ -48,8 +48,8 @@ class ActorCriticConfig:
         for name in ("hidden_size", "num_updates", "batch_size", "horizon"):
             check_count(name, getattr(self, name))
         for name in ("discount", "trace", "restart", "target_rate", "pessimism"):
-            check_scalar(name, getattr(self, name), 0.0, 1.0)
-        check_scalar("noise", self.noise, 0.0)
+            keep_checked(self, name, check_scalar, 0.0, 1.0)
+        keep_checked(self, "noise", check_scalar, 0.0)
         if not isinstance(self.discount, Array) and self.discount == 1.0:
             raise ValueError("discount must be below 1, got 1.0.")
 

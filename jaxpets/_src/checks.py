@@ -5,7 +5,7 @@ Every message names the argument, what was wanted and what came.
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeGuard, cast
 
 import jax
@@ -43,8 +43,12 @@ def check_flag(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be True or False, got {value!r}.")
 
 
-def check_real(name: str, value: Any, low: float, high: float = math.inf) -> None:
-    """Raises unless `value` is a finite Python number in `[low, high]`."""
+def check_real(name: str, value: Any, low: float, high: float = math.inf) -> float:
+    """Returns `value`, a finite number in `[low, high]`, as a Python number, or raises.
+
+    A Python number takes the type of what it meets; NumPy's of 64 bits would give its
+    own to it under x64.
+    """
     if isinstance(value, bool) or not _is_number(value):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python float, got {value!r} ({kind}).")
@@ -53,19 +57,30 @@ def check_real(name: str, value: Any, low: float, high: float = math.inf) -> Non
         if high == math.inf:
             valid = f"finite and at least {low:g}"
         raise ValueError(f"{name} must be {valid}, got {value!r}.")
+    return value.item() if isinstance(value, (np.float64, np.integer)) else value
 
 
-def check_scalar(name: str, value: Any, low: float, high: float = math.inf) -> None:
-    """Raises unless `value` is a number in `[low, high]` or a float32 scalar in it.
+def check_scalar(
+    name: str, value: Any, low: float, high: float = math.inf
+) -> float | Array:
+    """Returns `value`, a number in `[low, high]` as `check_real` does, or raises.
 
-    A traced one is not checked for its range: it is what a sweep maps over.
+    It may be a float32 scalar, which is returned as it is. A traced one is not checked
+    for its range: it is what a sweep maps over.
     """
-    if isinstance(value, Array):
-        check_array(name, value, [])
-        if isinstance(value, Tracer):
-            return
-        value = float(value)
-    check_real(name, value, low, high)
+    if not isinstance(value, Array):
+        return check_real(name, value, low, high)
+    check_array(name, value, [])
+    if not isinstance(value, Tracer):
+        check_real(name, float(value), low, high)
+    return cast(Array, value)
+
+
+def keep_checked(
+    config: Any, name: str, check: Callable[..., Any], *limits: float
+) -> None:
+    """Has a frozen config keep what a check of one of its fields returns."""
+    object.__setattr__(config, name, check(name, getattr(config, name), *limits))
 
 
 def nearest(name: Any, names: Sequence[str]) -> list[str]:
@@ -73,12 +88,11 @@ def nearest(name: Any, names: Sequence[str]) -> list[str]:
     return difflib.get_close_matches(str(name), names, n=3, cutoff=0.4)
 
 
-def check_reals(name: str, values: Any, low: float) -> None:
-    """Raises unless `values` is a tuple or list of finite numbers of at least `low`."""
+def check_reals(name: str, values: Any, low: float) -> tuple[float, ...]:
+    """Returns a tuple or list of finite numbers of at least `low`, or raises."""
     if not is_sequence(values):
         raise TypeError(f"{name} must be a tuple of floats, got {values!r}.")
-    for value in values:
-        check_real(name, value, low)
+    return tuple(check_real(name, value, low) for value in values)
 
 
 def check_record(name: str, value: Any, record: type) -> None:

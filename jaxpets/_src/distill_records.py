@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from jax import Array
 
 from jaxpets._src.actor_critic_records import ActorCriticParams, Guided
-from jaxpets._src.checks import check_count, check_scalar
+from jaxpets._src.checks import check_count, check_scalar, keep_checked
 from jaxpets._src.types import Dataset, Planner, PlanParams, RewardFn
 
 
@@ -44,9 +44,9 @@ class DistillConfig:
         for name in ("hidden_size", "num_trials", "horizon", "capacity", "num_updates",
                      "batch_size"):  # fmt: skip
             check_count(name, getattr(self, name))
-        check_scalar("planned", self.planned, 0.0, 1.0)
-        check_scalar("noise", self.noise, 0.0)
-        check_scalar("restart", self.restart, 0.0, 1.0)
+        keep_checked(self, "planned", check_scalar, 0.0, 1.0)
+        keep_checked(self, "noise", check_scalar, 0.0)
+        keep_checked(self, "restart", check_scalar, 0.0, 1.0)
 
 
 class Plans(NamedTuple):

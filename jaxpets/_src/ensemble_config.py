@@ -10,6 +10,7 @@ from jaxpets._src.checks import (
     check_reals,
     check_record,
     is_sequence,
+    keep_checked,
 )
 from jaxpets._src.network import ACTIVATIONS, Precision
 
@@ -46,11 +47,12 @@ class EnsembleConfig:
     def __post_init__(self) -> None:
         check_count("num_members", self.num_members)
         check_counts("hidden_sizes", self.hidden_sizes)
-        _check_decays(self.weight_decays, len(self.hidden_sizes) + 1)
-        check_real("bound_decay", self.bound_decay, 0.0)
+        num_layers = len(self.hidden_sizes) + 1
+        keep_checked(self, "weight_decays", _check_decays, num_layers)
+        keep_checked(self, "bound_decay", check_real, 0.0)
         check_record("precision", self.precision, Precision)
         if self.state_margin is not None:
-            check_real("state_margin", self.state_margin, 0.0)
+            keep_checked(self, "state_margin", check_real, 0.0)
         if self.activation not in ACTIVATIONS:
             valid = ", ".join(ACTIVATIONS)
             raise ValueError(
@@ -58,18 +60,16 @@ class EnsembleConfig:
             )
 
 
-def _check_decays(decays: Any, num_layers: int) -> None:
+def _check_decays(name: str, decays: Any, num_layers: int) -> Any:
     if decays is None:
-        return
+        return None
     if not is_sequence(decays):
-        check_real("weight_decays", decays, 0.0)
-        return
-    check_reals("weight_decays", decays, 0.0)
-    if len(decays) != num_layers:
-        raise ValueError(
-            f"weight_decays must be a number or one per layer ({num_layers}), got "
-            f"{len(decays)}."
-        )
+        return check_real(name, decays, 0.0)
+    if len(decays) == num_layers:
+        return check_reals(name, decays, 0.0)
+    raise ValueError(
+        f"{name} must be a number or one per layer ({num_layers}), got {len(decays)}."
+    )
 
 
 def layer_decays(config: EnsembleConfig) -> tuple[float, ...]:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from jax import Array
 
-from jaxpets._src.checks import check_count, check_flag, check_real
+from jaxpets._src.checks import check_count, check_flag, check_real, keep_checked
 from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.types import Dataset
 
@@ -35,7 +35,7 @@ class FitConfig:
     def __post_init__(self) -> None:
         check_count("num_epochs", self.num_epochs)
         check_count("batch_size", self.batch_size)
-        check_real("final_rate", self.final_rate, 0.0, 1.0)
+        keep_checked(self, "final_rate", check_real, 0.0, 1.0)
         check_flag("bootstrap", self.bootstrap)
 
 

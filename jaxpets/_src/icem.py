@@ -107,7 +107,9 @@ def icem(
     check_count("num_elites", num_elites, minimum=2)
     check_count("num_samples", num_samples, minimum=num_elites)
     check_count("num_iterations", num_iterations)
-    _check_numbers(momentum, noise_beta, init_std, kept_fraction, decay)
+    momentum, noise_beta, init_std = _numbers(
+        momentum, noise_beta, init_std, kept_fraction, decay
+    )
     _check_flags(execute_best, unroll, keep_candidates)
     shape = (horizon, box.center.shape[0])
     num_kept = round(kept_fraction * num_elites)
@@ -195,18 +197,21 @@ def icem(
     return TrajectoryOptimizer(init, step)
 
 
-def _check_numbers(
+def _numbers(
     momentum: float | Array,
     noise_beta: float | Array,
     init_std: float | Array,
     kept_fraction: float,
     decay: float,
-) -> None:
-    check_scalar("momentum", momentum, 0.0, 1.0)
-    check_scalar("noise_beta", noise_beta, 0.0)
-    check_scalar("init_std", init_std, 1e-6)
+) -> tuple[float | Array, float | Array, float | Array]:
+    """Checks all of them and returns those that may be traced."""
     check_real("kept_fraction", kept_fraction, 0.0, 1.0)
     check_real("decay", decay, 1.0)
+    return (
+        check_scalar("momentum", momentum, 0.0, 1.0),
+        check_scalar("noise_beta", noise_beta, 0.0),
+        check_scalar("init_std", init_std, 1e-6),
+    )
 
 
 def _check_flags(execute_best: bool, unroll: bool, keep_candidates: bool) -> None:

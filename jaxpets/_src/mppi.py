@@ -75,8 +75,8 @@ def mppi(
     box = action_box(action_low, action_high)
     check_count("num_samples", num_samples, minimum=2)
     check_count("num_iterations", num_iterations)
-    check_scalar("std", std, 1e-6)
-    check_scalar("temperature", temperature, 1e-6)
+    std = check_scalar("std", std, 1e-6)
+    temperature = check_scalar("temperature", temperature, 1e-6)
     check_flag("keep_candidates", keep_candidates)
     scale = std * box.half_width
     shape = (horizon, box.center.shape[0])

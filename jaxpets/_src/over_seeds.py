@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -89,7 +89,8 @@ def _check_seeds(name: str, tree: Any, num_seeds: int) -> None:
 
     The programs of one seed would take the first of several, without a word.
     """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+    leaves = cast(list[Any], jax.tree_util.tree_leaves_with_path(tree))
+    for path, leaf in leaves:
         shape = jnp.shape(leaf)
         if shape[:1] != (num_seeds,):
             raise ValueError(

@@ -63,7 +63,7 @@ def random_planner(
         period below 2.
     """
     box = action_box(action_low, action_high)
-    check_real("noise_beta", noise_beta, 0.0)
+    noise_beta = check_real("noise_beta", noise_beta, 0.0)
     check_count("period", period, minimum=2)
     if noise_beta:
         return _colored(box, noise_beta, period)

@@ -59,7 +59,7 @@ def candidate_returns(
     at once, and no reward of a particle is kept.
     """
     reward = checked_reward(reward_fn)
-    check_scalar("discount", discount, 0.0, 1.0)
+    discount = check_scalar("discount", discount, 0.0, 1.0)
     undiscounted = not isinstance(discount, Array) and discount == 1
     if terminal_fn is None and risk_fn is None and value_fn is None and undiscounted:
         return _mean_returns(reward)

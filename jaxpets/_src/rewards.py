@@ -106,7 +106,7 @@ def pessimistic(reward_fn: RewardFn, caution: float) -> RewardFn:
       TypeError, ValueError: unless caution is a finite number of at least 0.
     """
     check_callable("reward_fn", reward_fn)
-    check_real("caution", caution, 0.0)
+    caution = check_real("caution", caution, 0.0)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         check_array("next_obs", next_obs, ["E", "P", "D"])

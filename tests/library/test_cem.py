@@ -187,9 +187,20 @@ def test_rejected_candidates_are_no_elites():
     assert -0.9 < solution.actions[0, 0] < -0.4
 
 
-def test_draws_in_float32_where_64_bits_are_enabled():
-    optimizer = search()
+NUMBERS = {
+    "cem": ("momentum", "min_variance"),
+    "icem": ("momentum", "noise_beta", "init_std"),
+    "mppi": ("std", "temperature"),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_draws_in_float32_where_64_bits_are_enabled(name):
+    """Also where its numbers are of 64 bits, as NumPy's are."""
+    numbers = {x: np.float64(0.1) for x in NUMBERS[name]}
+    build = getattr(jaxpets.optimizers, name)
     with jax.enable_x64(True):
+        optimizer = build(horizon=5, action_low=-ONE, action_high=ONE, **numbers)
         solution, _ = optimizer.step(
             lambda key, actions: -jnp.sum(actions**2, (1, 2)),
             jax.random.key(0),

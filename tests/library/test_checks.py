@@ -3,6 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxpets
+from jaxpets import policies
 from jaxpets._src import checks
 from jaxpets._src.action_box import action_box
 
@@ -38,6 +40,36 @@ def test_real_without_a_greatest_value_says_so():
     for value in (-1.0, float("inf")):
         with pytest.raises(ValueError, match="decay must be finite and at least 0"):
             checks.check_real("decay", value, 0.0)
+
+
+@pytest.mark.parametrize("value", [np.float64(0.1), np.int64(1), np.int32(1)])
+def test_a_number_of_numpy_becomes_one_of_python(value):
+    found = checks.check_scalar("std", value, 0.0, 1.0)
+    assert type(found) in (int, float) and found == value
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        (jaxpets.EnsembleConfig, "bound_decay"),
+        (jaxpets.EnsembleConfig, "state_margin"),
+        (jaxpets.EnsembleConfig, "weight_decays"),
+        (jaxpets.FitConfig, "final_rate"),
+        (policies.ActorCriticConfig, "trace"),
+        (policies.ActorCriticConfig, "noise"),
+        (policies.DistillConfig, "planned"),
+        (policies.DistillConfig, "noise"),
+        (policies.DistillConfig, "restart"),
+    ],
+)
+def test_a_config_keeps_numbers_of_python(config, name):
+    """Those of NumPy make float64 of what they meet under x64."""
+    assert type(getattr(config(**{name: np.float64(0.5)}), name)) is float
+
+
+@pytest.mark.parametrize("value", [0.1, 1, np.float32(0.1), jnp.float32(0.1)])
+def test_any_other_number_is_as_it_came(value):
+    assert checks.check_scalar("std", value, 0.0, 1.0) is value
 
 
 @pytest.mark.parametrize("value", [0.5, np.float32(0.5), jnp.float32(0.5)])
