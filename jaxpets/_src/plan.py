@@ -105,9 +105,10 @@ def plan(
     if chunk_size is not None:
         check_count("chunk_size", chunk_size)
 
+    wanted: Any = None
     if propose_fn is not None:
         check_callable("propose_fn", propose_fn)
-        _check_mean(optimizer)
+        wanted = _state_with_mean(optimizer)
     returns = candidate_returns(reward_fn, terminal_fn, discount, risk_fn, value_fn)
 
     def step(
@@ -134,9 +135,12 @@ def plan(
             )
 
         if propose_fn is not None:
+            # The search does so, too, but its mean is needed before.
+            check_record("state", state, wanted.__class__)
+            check_array("state.mean", state.mean, wanted.mean.shape)
             key, propose_key, value_key = jax.random.split(key, 3)
             proposal = propose_fn(params, propose_key, obs)
-            check_array("propose_fn's result", proposal, state.mean.shape)
+            check_array("propose_fn's result", proposal, wanted.mean.shape)
             both = jnp.stack([state.mean, proposal])
             last, new = objective(value_key, both)
             state = state._replace(mean=jnp.where(new > last, proposal, state.mean))
@@ -147,14 +151,15 @@ def plan(
     return Planner(optimizer.init, step)
 
 
-def _check_mean(optimizer: TrajectoryOptimizer) -> None:
-    """Raises unless the state of a search says where it begins."""
+def _state_with_mean(optimizer: TrajectoryOptimizer) -> Any:
+    """Returns a search's state as shapes; raises unless it says where it begins."""
     state = jax.eval_shape(optimizer.init)
     if not hasattr(state, "mean"):
         kind = type(state).__name__
         raise TypeError(
             f"optimizer must have a state with a mean for propose_fn, got {kind}."
         )
+    return state
 
 
 def _bound(rollout_fn: RolloutFn, params: Any) -> Callable[[Array, Any, Array], Array]:

@@ -100,6 +100,12 @@ def test_wrong_arguments_are_refused():
     params = PlanParams(GAIN, jnp.float32(5.0))
     with pytest.raises(ValueError, match=r"result must be float32\[4, 1\]"):
         short.step(params, jax.random.key(0), search.init(), FAR)
+    with pytest.raises(TypeError, match="state must be a CEMState, got tuple"):
+        short.step(params, jax.random.key(0), (), FAR)
+    longer = toys.optimizer("cem", horizon=HORIZON + 1).init()
+    message = r"state\.mean must be float32\[4, 1\], got float32\[5, 1\]"
+    with pytest.raises(ValueError, match=message):
+        short.step(params, jax.random.key(0), longer, FAR)
     with pytest.raises(TypeError, match="policy must be a Planner"):
         policies.prior(None, toys.cart, horizon=2)
     with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
