@@ -102,6 +102,7 @@ def actor_critic(
     check_space_size(space, obs_size)
     check_count("num_members", num_members)
     box = action_box(action_low, action_high)
+    sizes = (obs_size, box.center.shape[0])
     networks = build_networks(config.hidden_size, space, goals, box)
     learn = build_update(networks, optimizer, config, box)
     rows = (num_members, -(-config.batch_size // num_members))
@@ -118,7 +119,7 @@ def actor_critic(
     starts = trial_starts(goals.draw, rows)
 
     def init(params: PlanParams, key: Array, dataset: Dataset) -> ActorCriticState:
-        check_imagined(params, key, dataset, obs_size)
+        check_imagined(params, key, dataset, *sizes)
         start_key, draw_key, network_key = jax.random.split(key, 3)
         obs, rewards = starts(params.reward, start_key, dataset)
         low, high = reward_range(
@@ -159,7 +160,7 @@ def actor_critic(
     def step(
         params: PlanParams, key: Array, state: ActorCriticState, dataset: Dataset
     ) -> tuple[ActorCriticState, ActorCriticMetrics]:
-        check_imagined(params, key, dataset, obs_size)
+        check_imagined(params, key, dataset, *sizes)
         check_record("state", state, ActorCriticState)
         keys = jax.random.split(key, config.num_updates)
         state, every = jax.lax.scan(

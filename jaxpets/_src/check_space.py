@@ -22,7 +22,7 @@ def check_space(
 
     Args:
       space: what to try.
-      obs: `[T, D]`, as a Transition has them.
+      obs: `[T, D]`, as a Transition has them; at least one row.
       next_obs: `[T, D]`.
       tolerance: how far an entry may be off, as a share of the largest number in it.
 
@@ -33,6 +33,7 @@ def check_space(
     check_array("obs", obs, ["T", "D"])
     check_array("next_obs", next_obs, list(jnp.shape(obs)))
     num_rows, obs_size = jnp.shape(obs)
+    check_count("the number of rows of obs", num_rows)
     features, target = space.features(obs), space.target(obs, next_obs)
     check_array("space.features's result", features, [num_rows, "F"])
     check_array("space.target's result", target, [num_rows, obs_size])

@@ -53,7 +53,7 @@ def append(
       dataset: what there is.
       transitions: `[T, D]`, `[T, A]`, `[T, D]`, T at most the capacity.
       count: `[]` int32, how many of the rows are meant, the first ones; None for all.
-        So that trials of any length are appended by one program.
+        So that trials of any length are appended by one program. More than T are T.
 
     Raises:
       TypeError, ValueError: if a record, a width, a length or a dtype does not fit.
@@ -63,9 +63,9 @@ def append(
     rows = (dataset.cursor + jnp.arange(length, dtype=jnp.int32)) % capacity
     added: int | Array = length
     if count is not None:
+        added = jnp.clip(count, 0, length)
         # Beyond the last row nothing is written.
-        rows = jnp.where(jnp.arange(length) < count, rows, capacity)
-        added = count
+        rows = jnp.where(jnp.arange(length) < added, rows, capacity)
     data = Transition(
         *(
             old.at[rows].set(new)

@@ -109,6 +109,7 @@ def distill(
     check_space_size(space, obs_size)
     check_count("num_members", num_members)
     box = action_box(action_low, action_high)
+    sizes = (obs_size, box.center.shape[0])
     networks = build_networks(config.hidden_size, space, goals, box)
     reward, is_guided = guided_reward(reward_fn), not isinstance(planner, Planner)
     if not isinstance(planner, Planner):
@@ -127,7 +128,7 @@ def distill(
     )  # fmt: skip
 
     def init(params: PlanParams, key: Array, dataset: Dataset) -> DistillState:
-        check_imagined(params, key, dataset, obs_size)
+        check_imagined(params, key, dataset, *sizes)
         start_key, draw_key, network_key, plan_key = jax.random.split(key, 4)
         obs, rewards, planning = trials.fresh(params.reward, start_key, dataset)
         low, high = reward_range(
@@ -140,8 +141,8 @@ def distill(
         largest = plan[0].actions.shape[2] * jnp.maximum(high, -low)
         scale = 1.0 / jnp.where(largest > 0.0, largest, 1.0)
         found = found._replace(scale=scale)
-        sizes = (found.mean.shape, box.center.shape, (), ())
-        plans = Plans(*(jnp.zeros((capacity, *x), jnp.float32) for x in sizes))
+        shapes = (found.mean.shape, box.center.shape, (), ())
+        plans = Plans(*(jnp.zeros((capacity, *x), jnp.float32) for x in shapes))
         opt_state = optimizer.init(cast(Any, (found.actor, found.critics)))
         none = jnp.zeros((), jnp.int32)
         return DistillState(found, opt_state, obs, rewards, planning, plans, none, none)
@@ -149,7 +150,7 @@ def distill(
     def step(
         params: PlanParams, key: Array, state: DistillState, dataset: Dataset
     ) -> tuple[DistillState, DistillMetrics]:
-        check_imagined(params, key, dataset, obs_size)
+        check_imagined(params, key, dataset, *sizes)
         check_record("state", state, DistillState)
         noise_key, ask_key, learn_key = jax.random.split(key, 3)
         noise = config.noise * jax.random.uniform(noise_key, (*rows, 1), jnp.float32)

@@ -172,7 +172,8 @@ def ensemble(
     ) -> tuple[Array, Array]:
         check_params(params)
         check_array("obs", obs, [config.num_members, "B", obs_size])
-        check_array("action", action, ["...", obs.shape[1], action_size])
+        members = obs.shape[:1] if getattr(action, "ndim", 0) == 3 else ()
+        check_array("action", action, [*members, obs.shape[1], action_size])
         actions = jnp.broadcast_to(action, (*obs.shape[:-1], action_size))
         inputs = encode_inputs(params.scaler, obs, actions)
         mean, raw = forward(params.network, inputs)

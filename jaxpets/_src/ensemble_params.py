@@ -56,8 +56,13 @@ class EnsembleParams(NamedTuple):
 
 
 def max_variance(params: EnsembleParams) -> Array:
-    """Returns `exp(max_logvar)` `[D]` in units of obs squared: the paper's w_base."""
+    """Returns `exp(max_logvar)` `[D]` in units of obs squared: the paper's w_base.
+
+    Raises:
+      TypeError: unless params are those of an ensemble of `jaxpets.ensemble`.
+    """
     check_record("params", params, EnsembleParams)
+    check_record("params.network", params.network, NetworkParams)
     return jnp.exp(params.network.max_logvar)
 
 

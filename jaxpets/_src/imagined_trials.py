@@ -159,9 +159,12 @@ def reward_range(
     return jnp.minimum(jnp.min(rewards), 0.0), jnp.maximum(jnp.max(rewards), 0.0)
 
 
-def check_imagined(params: Any, key: Any, dataset: Any, obs_size: int) -> None:
+def check_imagined(
+    params: Any, key: Any, dataset: Any, obs_size: int, action_size: int
+) -> None:
     """Raises unless these are what trials can be imagined with."""
     check_record("params", params, PlanParams)
     check_key("key", key)
     check_record("dataset", dataset, Dataset)
     check_array("dataset.data.obs", dataset.data.obs, ["C", obs_size])
+    check_array("dataset.data.action", dataset.data.action, ["C", action_size])

@@ -9,7 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count, check_key, check_real
+from jaxpets._src.checks import (
+    check_array,
+    check_callable,
+    check_count,
+    check_key,
+    check_real,
+    is_sequence,
+)
 from jaxpets._src.coordinates import space
 from jaxpets._src.types import Env, EnvState
 from jaxpets.envs.engines import Engine, Physics, mjx_engine, native_engine
@@ -80,9 +87,16 @@ def mujoco_env(
     Raises:
       TypeError, ValueError: naming what cannot be: a model that does not compile or has
         no actuator or one without a range, a name that is no entry, a time that is no
-        multiple, or what the backend lacks.
+        multiple, a function or a number of threads that is none, or what the backend
+        lacks.
       FileNotFoundError: if there is no such file.
     """
+    for name, function in (("terminal_fn", terminal_fn), ("constants", constants)):
+        if function is not None:
+            check_callable(name, function)
+    if num_threads is not None:
+        check_count("num_threads", num_threads)
+    check_real("settle_time", settle_time, 0.0)
     model = load_model(model)
     found = readings(model, observe)
     coordinates = space([reading.coordinate for reading in found]).coordinates
@@ -184,7 +198,7 @@ def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:
 def _num_settling(settle_time: float, step_time: float) -> int:
     """Returns how many steps of the environment go before a trial."""
     count = round(settle_time / step_time)
-    if settle_time < 0 or abs(settle_time - count * step_time) > 1e-6 * step_time:
+    if abs(settle_time - count * step_time) > 1e-6 * step_time:
         raise ValueError(
             f"settle_time must be a multiple of the {step_time:g} s of a step, "
             f"got {settle_time!r}."
@@ -210,8 +224,8 @@ def _start_fn(model: Any, reset: ResetFn | Sequence[str] | None) -> ResetFn:
     qpos, qvel = np.array([model.qpos0]), np.zeros((1, model.nv))
     if reset is not None:
         names = [model.key(i).name for i in range(model.nkey)]
-        unknown = [name for name in reset if name not in names]
-        if isinstance(reset, str) or not reset or unknown:
+        is_names = is_sequence(reset) and all(name in names for name in reset)
+        if not (is_names and reset):
             raise ValueError(f"reset must be keyframes among {names}, got {reset!r}.")
         chosen = [names.index(name) for name in reset]
         qpos, qvel = model.key_qpos[chosen], model.key_qvel[chosen]

@@ -332,6 +332,10 @@ def test_wrong_arguments_fail_when_traced():
     params = PlanParams(WORLD, Task())
     with pytest.raises(ValueError, match=r"dataset.data.obs must be float32\[C, 2\]"):
         learner.init(params, jax.random.key(0), data)
+    data = jaxpets.datasets.init(5, 2, 2)
+    message = r"dataset.data.action must be float32\[C, 1\], got float32\[5, 2\]"
+    with pytest.raises(ValueError, match=message):
+        learner.init(params, jax.random.key(0), data)
     with pytest.raises(TypeError, match="params must be a PlanParams"):
         learner.init(WORLD, jax.random.key(0), states())
     with pytest.raises(TypeError, match=r"params.reward must be a Guided"):

@@ -196,6 +196,9 @@ WRONG = {
         "params.network must be a NetworkParams"),
     "max_variance": (
         lambda: rewards.max_variance(None), "params must be an EnsembleParams"),
+    "max_variance of a model of another kind": (
+        lambda: rewards.max_variance(EnsembleParams((), ())),
+        "params.network must be a NetworkParams"),
     "epistemic": (
         lambda: rewards.epistemic(None, *STEP), r"baseline_variance must be float32\["),
     "information_gain": (

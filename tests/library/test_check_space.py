@@ -19,6 +19,12 @@ def check(space, data=DATA, **options):
     jaxpets.check_space(space, data.obs, data.next_obs, **options)
 
 
+def test_without_rows_there_is_nothing_to_try():
+    message = "the number of rows of obs must be at least 1, got 0"
+    with pytest.raises(ValueError, match=message):
+        check(SPACE, jax.tree.map(lambda x: x[:0], DATA))
+
+
 def test_a_space_that_keeps_the_law_passes():
     check(SPACE)
 

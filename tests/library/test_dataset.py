@@ -66,6 +66,14 @@ def test_keeps_the_newest_rows(lengths):
         assert held(dataset) == sorted(queue)
 
 
+@pytest.mark.parametrize(("count", "wanted"), [(-1, 0), (0, 0), (2, 2), (3, 3), (7, 3)])
+def test_no_more_rows_are_counted_than_there_are(count, wanted):
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
+    after = append(dataset, numbered(1, 3), jnp.int32(count))
+    assert after.cursor == wanted and held(after) == [1, 2, 3][:wanted]
+    assert toys.avals(after) == toys.avals(dataset)
+
+
 def test_one_trace_while_it_grows():
     append = jax.jit(functools.partial(jaxpets.datasets.append))  # a cache of its own
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)

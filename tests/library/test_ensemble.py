@@ -338,8 +338,10 @@ def test_wrong_arguments_fail_when_traced(model, params):
     obs, action = batch()
     with pytest.raises(ValueError, match=r"obs must be float32\[3, B, 2\], got"):
         model.predict(params, obs[:2], action)
-    with pytest.raises(ValueError, match=r"action must be float32\[..., 7, 1\], got"):
+    with pytest.raises(ValueError, match=r"action must be float32\[7, 1\], got"):
         model.sample(params, jax.random.key(0), obs, action[:5])
+    with pytest.raises(ValueError, match=r"action must be float32\[3, 7, 1\], got"):
+        model.predict(params, obs, jnp.stack([action] * 2))
 
 
 @pytest.mark.parametrize(

@@ -216,9 +216,19 @@ BAD = {
     "settle_time must be a multiple of the 0.02 s of a step, got 0.03": (
         CART, {"control_step": 0.02, "settle_time": 0.03},
     ),
-    "settle_time must be a multiple of the 0.02 s of a step, got -0.02": (
+    "settle_time must be finite and at least 0, got -0.02": (
         CART, {"control_step": 0.02, "settle_time": -0.02},
     ),
+    "settle_time must be finite and at least 0, got nan": (
+        CART, {"settle_time": float("nan")},
+    ),
+    "settle_time must be a Python float, got '1'": (CART, {"settle_time": "1"}),
+    "terminal_fn must be a function, got 5": (CART, {"terminal_fn": 5}),
+    "constants must be a function, got 5": (CART, {"constants": 5}),
+    "num_threads must be at least 1, got -3": (
+        CART, {"backend": "mjx", "num_threads": -3},
+    ),
+    "reset must be keyframes among ..left., .right.., got 5": (CART, {"reset": 5}),
     "action_repeat must be at least 1": (CART, {"action_repeat": 0}),
     "reset must be keyframes among ..left., .right.., got .'up',.": (
         CART, {"reset": ("up",)},
