@@ -51,7 +51,8 @@ def build_networks(
     """Builds the functions; see `actor_critic` for the arguments.
 
     Raises:
-      TypeError: if space or goals are something else.
+      TypeError: if space or goals are something else; ValueError, when traced, if
+        goals.features does not return what the params are for.
     """
     check_record("space", space, ModelSpace)
     check_record("goals", goals, Goals)
@@ -73,8 +74,16 @@ def build_networks(
         return ActorCriticParams(actor.init(actor_key, mean), critics, mean, std, one)
 
     def see(params: ActorCriticParams, goal: Array, obs: Array) -> Array:
-        goal = jnp.broadcast_to(goal, (*obs.shape[:-1], goal.shape[-1]))
-        seen = jnp.concatenate([space.features(obs), goal], axis=-1)
+        features = space.features(obs)
+        size = params.mean.shape[0] - features.shape[-1]
+        if goal.shape[-1:] != (size,):
+            raise ValueError(
+                f"goals.features must return [{size}], as where the policy was "
+                f"learned, got {list(goal.shape[-1:])}; a policy of a family of tasks "
+                "needs its goals."
+            )
+        goal = jnp.broadcast_to(goal, (*obs.shape[:-1], size))
+        seen = jnp.concatenate([features, goal], axis=-1)
         return jnp.clip((seen - params.mean) / params.std, -CLIP, CLIP)
 
     def judge(critics: Any, seen: Array, action: Array) -> Array:

@@ -13,7 +13,7 @@ from jaxpets._src.checks import (
     check_key,
     check_record,
 )
-from jaxpets._src.returns import single_reward
+from jaxpets._src.returns import of_particles, single_reward
 from jaxpets._src.types import (
     Dataset,
     DynamicsFn,
@@ -71,11 +71,13 @@ def imagine(
       `(params, policy's params, key, rewards [E, B, ...], obs [E, B, D]) -> Imagined`.
 
     Raises:
-      TypeError: if dynamics_fn or terminal_fn is no function.
+      TypeError: if dynamics_fn or terminal_fn is no function; ValueError, when
+        traced, if terminal_fn returns something else.
     """
     check_callable("dynamics_fn", dynamics_fn)
+    ends = None
     if terminal_fn is not None:
-        check_callable("terminal_fn", terminal_fn)
+        ends = jax.vmap(jax.vmap(of_particles("terminal_fn", terminal_fn, jnp.bool_)))
     one = single_reward(reward_fn)
     rewards_of = jax.vmap(jax.vmap(one))
 
@@ -94,8 +96,8 @@ def imagine(
             next_obs = jnp.where(counts[..., None], next_obs, obs)
             reward = jnp.where(counts, reward, 0.0)
             goes_on = jnp.ones(counts.shape, bool)
-            if terminal_fn is not None:
-                goes_on = ~jax.vmap(jax.vmap(terminal_fn))(rewards, next_obs)
+            if ends is not None:
+                goes_on = ~ends(rewards, next_obs)
             seen = Imagined(obs, action, reward, next_obs, goes_on, counts)
             return (next_obs, counts & goes_on), seen
 
@@ -129,8 +131,14 @@ def over_trials(
     features: Callable[[Any], Array], rows: tuple[int, int]
 ) -> Callable[[Any], Array]:
     """Maps what networks see of a task over trials `[E, B]`."""
+
+    def one(data: Any) -> Array:
+        goal = features(data)
+        check_array("goals.features's result", goal, ["G"])
+        return goal
+
     # Sizes are said, as a reward may have no data to see them by.
-    return jax.vmap(jax.vmap(features, axis_size=rows[1]), axis_size=rows[0])
+    return jax.vmap(jax.vmap(one, axis_size=rows[1]), axis_size=rows[0])
 
 
 def renewed(again: Array, fresh: Any, old: Any) -> Any:

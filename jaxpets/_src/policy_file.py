@@ -78,7 +78,8 @@ def load_policy(
 
     Args:
       path: of the file.
-      goals: that it was built with; a file cannot hold its functions.
+      goals: that it was built with; a file cannot hold its functions. Without them a
+        policy of a family of tasks raises a ValueError when it acts.
       space: likewise, of one whose features are functions of your own.
 
     Returns:

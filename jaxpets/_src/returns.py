@@ -65,9 +65,9 @@ def candidate_returns(
         return _mean_returns(reward)
     ends = value = None
     if terminal_fn is not None:
-        ends = _of_particles("terminal_fn", terminal_fn, jnp.bool_)
+        ends = of_particles("terminal_fn", terminal_fn, jnp.bool_)
     if value_fn is not None:
-        value = _of_particles("value_fn", value_fn, jnp.float32)
+        value = of_particles("value_fn", value_fn, jnp.float32)
     risk = jnp.mean if risk_fn is None else _checked_risk(risk_fn)
 
     def every(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
@@ -119,7 +119,7 @@ def _alive(ends: Callable[[Any, Array], Array], params: Any, next_obs: Array) ->
     return ~jnp.concatenate([start, ended])
 
 
-def _of_particles(
+def of_particles(
     name: str, function: Callable[[Any, Array], Array], dtype: Any
 ) -> Callable[[Any, Array], Array]:
     """Returns a function with a check, when traced, of what it says of each particle.
@@ -132,8 +132,9 @@ def _of_particles(
         particles = obs.shape[:-1]
         result = jnp.asarray(function(params, obs))
         if result.dtype != dtype or result.shape not in ((), particles):
+            shapes = f"() or {particles}" if particles else "()"
             raise ValueError(
-                f"{name} must return {jnp.dtype(dtype)} of shape () or {particles}, "
+                f"{name} must return {jnp.dtype(dtype)} of shape {shapes}, "
                 f"got {result.dtype}{list(result.shape)}."
             )
         return jnp.broadcast_to(result, particles)

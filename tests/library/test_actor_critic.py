@@ -326,6 +326,33 @@ def test_bad_settings_fail_when_built(changes, error, text):
         build(**changes)
 
 
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            dict(terminal_fn=lambda task, obs: obs[..., 0]),
+            r"terminal_fn must return bool of shape \(\), got float32\[\]",
+        ),
+        (
+            dict(terminal_fn=lambda task, obs: jnp.int32(1)),
+            r"terminal_fn must return bool of shape \(\), got int32\[\]",
+        ),
+        (
+            dict(goals=Goals(features=lambda task: jnp.float32(1))),
+            r"goals.features's result must be float32\[G\], got float32\[\]",
+        ),
+    ],
+)
+def test_functions_that_return_something_else_are_named(changes, text):
+    learner, params = build(**changes), PlanParams(WORLD, Task())
+
+    def both(key, data):
+        return learner.step(params, key, learner.init(params, key, data), data)
+
+    with pytest.raises(ValueError, match=text):
+        jax.eval_shape(both, jax.random.key(0), states())
+
+
 def test_wrong_arguments_fail_when_traced():
     learner = build()
     data = jaxpets.datasets.init(5, 3, 1)

@@ -124,6 +124,10 @@ def test_what_comes_with_the_library_is_read():
     known = PlanParams((), policies.Guided(task, params))
     plan, _ = planner.step(known, jax.random.key(0), (), obs)
     assert plan.action.shape == (6,) and jnp.abs(plan.action).max() <= 1.0
+    alone, _ = policies.load_policy(policies.path("best"))
+    message = r"goals.features must return \[3\], as .* got \[0\]; .* needs its goals"
+    with pytest.raises(ValueError, match=message):
+        alone.step(known, jax.random.key(0), (), obs)
     found = jaxpets.models.about(policies.path("best"))
     assert (found["environment"], tuple(found["tasks"])) == (
         robot.name, robot.tasks.names,
