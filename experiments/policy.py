@@ -115,14 +115,13 @@ def of_file(path: Path, robot: Robot, env: str, names: Sequence[str]) -> Policy:
     path = model_file.named(path, "--policy", policies.path, plain="best")
     goals = family(robot, len(robot.tasks.names))
     try:
-        about = models.about(path)
+        _check_about(path, models.about(path), env, names)
         planner, networks = load_policy(path, goals=goals, space=robot.space)
     except FileNotFoundError as error:
         valid = "there is no such file"
         raise UsageError(f"--policy {path} is not valid; {valid}.") from error
     except (TypeError, ValueError) as error:
         raise CheckpointError(str(error)) from error
-    _check_about(path, about, env, names)
     found = Policy(planner, networks)
     task = jax.tree.map(lambda x: x[0], robot.tasks.params)
     try:

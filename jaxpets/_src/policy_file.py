@@ -106,7 +106,10 @@ def load_policy(
     except (TypeError, ValueError, OverflowError) as error:
         file_facts.refuse(file, str(error), error)
     space = space or file_facts.space_from_json(file, facts["space"], facts["obs_size"])
-    check_space_size(space, facts["obs_size"])
+    try:
+        check_space_size(space, facts["obs_size"])
+    except ValueError as error:
+        file_facts.refuse(file, str(error), error)
     first = file.shapes.get("actor.params.Dense_0.kernel", ())
     if len(first) != 2 or 0 in first:
         file_facts.refuse(file, f"its first layer must be of two axes, got {first}")

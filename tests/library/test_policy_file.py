@@ -10,8 +10,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from test_policy_onnx import BOX, SPACES, policy_of
 
-import jaxpets
-from jaxpets import PlanParams, coordinates, envs, policies
+from jaxpets import PlanParams, coordinates, envs, models, policies
 
 GOALS = policies.Goals(features=lambda target: jnp.stack([target, -target]))
 SPACE, SIZE = SPACES["turning"]
@@ -46,13 +45,13 @@ def test_what_was_saved_acts_the_same(policy, saved):
 
 def test_a_policy_needs_nothing_to_be_said_about_it(saved, tmp_path):
     path = tmp_path / "p"
-    assert jaxpets.models.about(saved) == {"a": 1}
+    assert models.about(saved) == {"a": 1}
     with safe_open(saved, "np") as file:
         texts = {k: v for k, v in file.metadata().items() if k != "about"}
     save_file(load_file(saved), path, texts)
     assert policies.load_policy(path, goals=GOALS)
     with pytest.raises(ValueError, match="its metadata lacks 'about'"):
-        jaxpets.models.about(path)
+        models.about(path)
 
 
 def test_own_functions_are_not_saved(policy, tmp_path):
@@ -112,7 +111,7 @@ def test_a_space_of_ones_own_has_the_size_of_the_file(saved):
 
 def test_a_model_is_no_policy():
     with pytest.raises(ValueError, match="no format 'jaxpets policy'"):
-        policies.load_policy(jaxpets.models.path("best"))
+        policies.load_policy(models.path("best"))
 
 
 def test_what_comes_with_the_library_is_read():
@@ -128,11 +127,11 @@ def test_what_comes_with_the_library_is_read():
     message = r"goals.features must return \[3\], as .* got \[0\]; .* needs its goals"
     with pytest.raises(ValueError, match=message):
         alone.step(known, jax.random.key(0), (), obs)
-    found = jaxpets.models.about(policies.path("best"))
+    found = models.about(policies.path("best"))
     assert (found["environment"], tuple(found["tasks"])) == (
         robot.name, robot.tasks.names,
     )  # fmt: skip
-    own = jaxpets.models.about(jaxpets.models.path("best"))["training"]
+    own = models.about(models.path("best"))["training"]
     same = ("arm", "seed", "num_trials", "trial_length", "refit")
     assert {x: found["training"][x] for x in same} == {x: own[x] for x in same}
     assert found["training"]["model"] == "pretrained/best"
