@@ -163,11 +163,7 @@ def begun(parts: Parts, found: Policy) -> jaxpets.Planner:
 
     Its reward data are Guided.
     """
-    reward_fn = parts.robot.tasks.reward_fn
-
-    def reward(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
-        return reward_fn(data.reward, obs, action, next_obs)
-
+    reward = policies.guided_reward(parts.robot.tasks.reward_fn)
     return parts.with_policy(found.planner, reward)
 
 

@@ -1,6 +1,7 @@
 """Policies and values of tasks, learned from a model alone; a policy comes along."""
 
 from jaxpets._src.actor_critic import actor_critic
+from jaxpets._src.actor_critic_networks import guided_reward
 from jaxpets._src.actor_critic_records import (
     ActorCritic,
     ActorCriticConfig,
@@ -34,6 +35,7 @@ __all__ = [
     "Goals",
     "Guided",
     "actor_critic",
+    "guided_reward",
     "load_policy",
     "path",
     "prior",

@@ -113,7 +113,15 @@ def build_networks(
 
 
 def guided_reward(reward_fn: RewardFn) -> RewardFn:
-    """Returns a reward that reads its data from Guided."""
+    """Builds a reward that reads its data from Guided, as a policy beside it does.
+
+    Args:
+      reward_fn: with data of its own.
+
+    Returns:
+      The same reward, whose data are `Guided.reward`. It raises a TypeError for what is
+      not Guided.
+    """
 
     def reward(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
         check_record("params.reward", data, Guided)
