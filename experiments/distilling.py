@@ -83,7 +83,7 @@ def distill(
     turns = max(config.distill.num_rounds, 1)
     learned_before = bool(run.steps())
     length = (3 if learned_before else turns + 2) * config.task_length
-    progress = Progress(length, 0, "distill", watch)
+    progress = Progress(length, 0, "distill", watch, run.update)
     placement, horizon = placed(run, len(config.seeds)), config.task_planner.horizon
     distiller = make_distiller(config, parts, tasks)
 

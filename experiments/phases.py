@@ -199,17 +199,11 @@ def zero_shot(
         devices.place(placement, model.params, SEED), task_params
     )
     num_chunks = config.task_length // config.chunk_length
-    progress = Progress(config.task_length, 0, "zero-shot", watch)
+    progress = Progress(config.task_length, 0, "zero-shot", watch, run.update)
     progress.compiling(cost.compiling("plan"))
-
-    def tick(steps: int) -> None:
-        progress.tick(steps)
-        rate, left = progress.pace()
-        run.update(steps_per_second=rate, seconds_left=left)
-
     begin = time.monotonic()
     with progress.interruptible():
-        trials = acting.run(actors, params, keys, num_chunks, tick)
+        trials = acting.run(actors, params, keys, num_chunks, progress.tick)
     trials = devices.collect(placement, trials, *devices.AXES)
     arm = rundir.label(config.arm)
     common = {"phase": "zero-shot", "arm": arm, "explored_trials": step}

@@ -4,7 +4,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import tqdm
 
@@ -39,7 +39,11 @@ class Watch:
 class Progress:
     """A bar over environment steps, lines per trial, and the wish to stop."""
 
-    def __init__(self, total: int, done: int, what: str, watch: Watch) -> None:
+    def __init__(
+        self, total: int, done: int, what: str, watch: Watch,
+        update: Callable[..., None] = lambda **_: None,
+    ) -> None:  # fmt: skip
+        """Begins to count; `update` is told the pace of every tick, as in `Status`."""
         self._shown = distributed.is_first()
         self._watch, self._compiles = watch, False
         watch.begin(what, done)
@@ -56,6 +60,7 @@ class Progress:
         )
         self._what = what
         self._start = self._said = time.monotonic()
+        self._update = update
         self._first, self._total, self._done = done, total, done
         self._stop = 0
 
@@ -68,6 +73,8 @@ class Progress:
         self.did(self._what, steps)
         self._done += steps
         self._bar.update(steps)
+        rate, left = self.pace()
+        self._update(steps_per_second=rate, seconds_left=left)
         if not sys.stderr.isatty() and time.monotonic() - self._said > _SILENCE:
             self.line(f"{self._what} {self._done}/{self._total} steps")
         if number := distributed.agree(self._stop):

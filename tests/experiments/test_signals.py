@@ -185,7 +185,12 @@ def test_a_log_gets_a_line_where_there_was_none_for_a_minute(monkeypatch, capsys
     now = [100.0]
     clock = SimpleNamespace(monotonic=lambda: now[0])
     monkeypatch.setattr("experiments.progress.time", clock)
-    progress = Progress(1000, 0, "walk", Watch())
+    told = []
+
+    def tell(steps_per_second, seconds_left):
+        told.append((now[0], round(seconds_left)))
+
+    progress = Progress(1000, 0, "walk", Watch(), tell)
 
     def ticks(*times):
         for now[0] in times:
@@ -197,6 +202,8 @@ def test_a_log_gets_a_line_where_there_was_none_for_a_minute(monkeypatch, capsys
     progress.line("a trial")
     assert len(ticks(230.0, 270.0)) == 1  # the trial's
     assert len(ticks(290.0)) == 1
+    # And what keeps the pace is told it at every tick.
+    assert told[:2] == [(130.0, 270), (160.5, 242)] and len(told) == 7
 
 
 def test_a_tick_that_does_not_come_is_not_waited_for(monkeypatch, capsys):
