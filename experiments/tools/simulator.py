@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{name:<{width}}{own.mean():8.0f}   trials: {each}")
         rows = [
             {
-                "env": args.env,
+                "robot": args.env,
                 "task": name,
                 "seed": args.seed,
                 "trial": i + 1,

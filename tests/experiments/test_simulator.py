@@ -52,3 +52,4 @@ def test_every_task_is_performed_and_logged(tmp_path, capsys):
     assert (returns[:, 0] != returns[:, 1]).all()
     assert rows[0]["task_planner"]["horizon"] == 10
     assert all(row["date"] and row["env"]["device_kind"] == "cpu" for row in rows)
+    assert {row["robot"] for row in rows} == {"pets/half_cheetah"}
