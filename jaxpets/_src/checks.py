@@ -110,6 +110,15 @@ def check_callable(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be a function, got {value!r} ({kind}).")
 
 
+def check_text(name: str, value: Any) -> None:
+    """Raises unless `value` is a text that says something."""
+    if not isinstance(value, str):
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be a text, got {value!r} ({kind}).")
+    if not value:
+        raise ValueError(f"{name} must not be empty, got ''.")
+
+
 def check_like(name: str, value: Any, template: Any) -> None:
     """Raises unless two pytrees agree in structure, shapes and dtypes.
 

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxpets.envs.mujoco_env import ConstantsFn, ResetFn
+from jaxpets.envs.mujoco_env import ConstantsFn
 from jaxpets.envs.starts import PostureFn, lifted, random_joints, without_contact
+from jaxpets.envs.trial_start import ResetFn
 
 
 def joints(model: Any) -> ResetFn:

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets.envs.mujoco_env import ConstantsFn, ResetFn
+from jaxpets.envs.mujoco_env import ConstantsFn
 from jaxpets.envs.starts import drawn_until
+from jaxpets.envs.trial_start import ResetFn
 
 _SPEED = 0.005
 _OBJECT = ("obj_slidey", "obj_slidex")

@@ -15,23 +15,20 @@ from jaxpets._src.checks import (
     check_count,
     check_key,
     check_real,
-    is_sequence,
 )
 from jaxpets._src.coordinates import space
 from jaxpets._src.types import Env, EnvState
 from jaxpets.envs.engines import Engine, Physics, mjx_engine, native_engine
 from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.observations import DEFAULT, Reading, readings
+from jaxpets.envs.trial_start import ResetFn, start_fn, unit_quaternions
 
 with needs_extra():
     import mujoco
 
 _C: Any = mujoco  # its names are made at import, where pyright does not see them
-_RESET_STD = 0.001  # as PETS starts HalfCheetah
 _STATE = ("mean_qvel", "qpos", "qvel", "act")
 
-# `(key) -> (qpos [Q], qvel [V])`.
-ResetFn = Callable[[Array], tuple[Array, Array]]
 # `(key) -> constants`, any pytree.
 ConstantsFn = Callable[[Array], Any]
 
@@ -70,7 +67,8 @@ def mujoco_env(
         environment takes as long.
       reset: names of keyframes, of which a trial starts at one at random; or `(key) ->
         (qpos [Q], qvel [V])`, whose quaternions are made unit; or None for the model's
-        own start. All but the function's are within 0.001 of what was named.
+        own start. All but the function's are within 0.001 of what was named, and have
+        its activations; from the function's they are 0.
       terminal_fn: `(obs [..., D]) -> bool [...]`, whether a trial ends there; None for
         never.
       settle_time: for how long physics goes on from there, with controls of zero, until
@@ -113,7 +111,7 @@ def mujoco_env(
         engine = mjx_engine(model, num_substeps=num_substeps, places=places)
     else:
         raise ValueError(f'backend must be "mujoco" or "mjx", got {backend!r}.')
-    start_fn = _start_fn(model, reset)
+    begin_fn = start_fn(model, reset)
     seen_fn = _seen_fn(model, found, engine, step_time)
 
     def begin(key: Array) -> EnvState:
@@ -122,12 +120,10 @@ def mujoco_env(
         if constants is not None:
             key, constants_key = jax.random.split(key)
             drawn = constants(constants_key)
-        qpos, qvel = start_fn(key)
-        check_array("the qpos of reset", qpos, [model.nq])
-        check_array("the qvel of reset", qvel, [model.nv])
+        qpos, qvel, act = begin_fn(key)
         still = jnp.zeros((model.nv,), jnp.float32)
-        act = jnp.zeros((model.na,), jnp.float32) if model.na else ()
-        physics = Physics(_unit_quaternions(model, qpos), qvel, still, act)
+        act = act if model.na else ()
+        physics = Physics(unit_quaternions(model, qpos), qvel, still, act)
         idle = jnp.zeros_like(low)
         physics = _settled(engine, physics, idle, num_settling)
         return EnvState(seen_fn(physics, physics, idle), physics, drawn)
@@ -215,44 +211,6 @@ def _settled(engine: Engine, physics: Physics, idle: Array, count: int) -> Physi
     if not count:
         return physics
     return cast(Physics, jax.lax.fori_loop(0, count, step, physics))
-
-
-def _start_fn(model: Any, reset: ResetFn | Sequence[str] | None) -> ResetFn:
-    """Returns what draws the start of a trial."""
-    if callable(reset):
-        return reset
-    qpos, qvel = np.array([model.qpos0]), np.zeros((1, model.nv))
-    if reset is not None:
-        names = [model.key(i).name for i in range(model.nkey)]
-        is_names = is_sequence(reset) and all(name in names for name in reset)
-        if not (is_names and reset):
-            raise ValueError(f"reset must be keyframes among {names}, got {reset!r}.")
-        chosen = [names.index(name) for name in reset]
-        qpos, qvel = model.key_qpos[chosen], model.key_qvel[chosen]
-    all_qpos, all_qvel = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
-
-    def start(key: Array) -> tuple[Array, Array]:
-        one: Any = 0
-        if len(all_qpos) > 1:
-            key, one_key = jax.random.split(key)
-            one = jax.random.randint(one_key, (), 0, len(all_qpos))
-        qpos_key, qvel_key = jax.random.split(key)
-        noise = jax.random.normal(qpos_key, (model.nq,), jnp.float32)
-        speed = jax.random.normal(qvel_key, (model.nv,), jnp.float32)
-        return all_qpos[one] + _RESET_STD * noise, all_qvel[one] + _RESET_STD * speed
-
-    return start
-
-
-def _unit_quaternions(model: Any, qpos: Array) -> Array:
-    """Returns positions whose quaternions are unit."""
-    free, ball = int(_C.mjtJoint.mjJNT_FREE), int(_C.mjtJoint.mjJNT_BALL)
-    for kind, start in zip(model.jnt_type, model.jnt_qposadr, strict=True):
-        if kind in (free, ball):
-            first = int(start) + (3 if kind == free else 0)
-            part = qpos[first : first + 4]
-            qpos = qpos.at[first : first + 4].set(part / jnp.linalg.norm(part))
-    return qpos
 
 
 def _seen_fn(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from jaxpets._src.checks import check_callable, check_real, check_text, is_sequence
 from jaxpets._src.coordinates import index, space
 from jaxpets._src.types import Coordinate, RewardFn
 from jaxpets.envs.mujoco_env import load_model, mujoco_env
@@ -52,10 +53,14 @@ def mujoco_robot(
         settle_time, constants, backend, num_threads.
 
     Raises:
-      TypeError, ValueError, FileNotFoundError: as `mujoco_env`, for an entry that is
-        none, and unless there is a task.
+      TypeError, ValueError, FileNotFoundError: as `mujoco_env`, for an entry, an axis
+        or a camera that is none, and unless there is a task.
     """
+    check_text("name", name)
+    check_callable("tasks", tasks)
+    _check_axes(axes)
     model = load_model(model)
+    _check_camera(model, camera)
     env = mujoco_env(
         model, control_step=control_step, action_repeat=action_repeat, **env_settings
     )
@@ -74,6 +79,22 @@ def mujoco_robot(
         action_repeat=action_repeat,
         step_time=step_time,
     )
+
+
+def _check_axes(axes: Any) -> None:
+    if not is_sequence(axes) or len(axes) not in {0, 2}:
+        raise ValueError(f"axes must be two of (name, unit, entry, end), got {axes!r}.")
+    for axis in axes:
+        if not is_sequence(axis) or len(axis) != len(Axis._fields):
+            raise ValueError(f"an axis must be (name, unit, entry, end), got {axis!r}.")
+        if not check_real("the end of an axis", axis[-1], 0.0):
+            raise ValueError("the end of an axis must be above 0, got 0.")
+
+
+def _check_camera(model: Any, camera: Any) -> None:
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if camera is not None and camera not in names:
+        raise ValueError(f"camera must be one of the model, {names}, got {camera!r}.")
 
 
 def _axis(

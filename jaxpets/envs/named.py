@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable
 
-from jaxpets._src.checks import nearest
+from jaxpets._src.checks import check_text, nearest
 from jaxpets.envs import half_cheetah
 from jaxpets.envs.dmc import DOMAINS, dmc
 from jaxpets.envs.gym import ROBOTS, gym
@@ -38,12 +38,13 @@ def make(name: str, *, backend: str = "mujoco") -> Robot:
         of a package have an engine of their own in JAX, and never another.
 
     Raises:
-      ValueError: if there is no such name; the nearest are said. Or for a backend that
-        is none, or cannot step this robot.
+      TypeError, ValueError: if there is no such name; the nearest are said. Or for a
+        backend that is none, or cannot step this robot.
       ImportError: if the package that has its model is missing; it names the extra.
     """
     if backend not in _BACKENDS:
         raise ValueError(f'backend must be "mujoco" or "mjx", got {backend!r}.')
+    check_text("name", name)
     package, _, own = name.partition("/")
     if package in REGISTRIES:
         return registered(package, own)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from jaxpets._src.checks import nearest
+from jaxpets._src.checks import is_sequence, nearest
 from jaxpets._src.types import Coordinate
 from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.symmetry import free_shifts
@@ -64,7 +64,7 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
     Raises:
       TypeError, ValueError: if a name is none of the model; the nearest are said.
     """
-    if isinstance(observe, str):
+    if not is_sequence(observe):
         raise TypeError(f"observe must be a sequence of names, got {observe!r}.")
     shifts = free_shifts(model)
     groups = _groups(model, set(shifts))

@@ -10,9 +10,10 @@ import numpy as np
 from jax import Array
 
 from jaxpets._src.types import Env, EnvState, RewardFn
-from jaxpets.envs.mujoco_env import ConstantsFn, ResetFn, mujoco_env
+from jaxpets.envs.mujoco_env import ConstantsFn, mujoco_env
 from jaxpets.envs.mujoco_robot import Entry, Shown, mujoco_robot
 from jaxpets.envs.robot import Robot, TrialParams
+from jaxpets.envs.trial_start import ResetFn
 
 Rewards = Mapping[str, RewardFn]
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.checks import check_callable, check_text
 from jaxpets._src.types import Env, EnvState, ModelSpace, RewardFn
 
 
@@ -101,11 +102,18 @@ def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:
         constants of the trial, or ().
 
     Raises:
-      ValueError: if there is none.
+      TypeError, ValueError: unless they are functions by name, one at least.
     """
+    given: Any = rewards
+    if not isinstance(given, Mapping):
+        kind = type(given).__name__
+        raise TypeError(f"rewards must be functions by name, got {kind}.")
     if not rewards:
         raise ValueError("rewards must have a task, got none.")
     names = tuple(rewards)
+    for name in names:
+        check_text("a name of rewards", name)
+        check_callable(f"rewards[{name!r}]", rewards[name])
 
     def reward_fn(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         if action.ndim > 1:  # of a recorded trial: its steps are rewarded one by one

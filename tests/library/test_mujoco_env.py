@@ -188,6 +188,26 @@ def test_trials_start_where_they_are_told(key):
     np.testing.assert_array_equal(state.physics.qvel, np.arange(10))
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+def test_a_keyframe_says_what_the_actuators_hold(backend, key):
+    xml = SLOW_CART.replace('name="left"', 'name="left" act="0.7"')
+    env = mujoco_env(xml, reset=("left",), observe=("act", "qpos"), backend=backend)
+    state = env.reset(key)
+    np.testing.assert_allclose(state.physics.act, [0.7])
+    np.testing.assert_allclose(state.obs[0], 0.7)
+    right = mujoco_env(xml, reset=("right",), backend=backend).reset(key)
+    np.testing.assert_array_equal(right.physics.act, [0.0])
+
+
+def test_a_start_may_be_of_numpy(key):
+    def own(key):
+        del key
+        return np.full(12, 2.0, np.float32), np.zeros(10, np.float32)
+
+    physics = mujoco_env(robots.FREE_XML, reset=own).reset(key).physics
+    np.testing.assert_allclose(physics.qpos[3:7], [0.5] * 4)
+
+
 def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     path = tmp_path / "cart.xml"
     path.write_text(CART)
@@ -234,6 +254,12 @@ BAD = {
         CART, {"reset": ("up",)},
     ),
     "reset must be keyframes .* got 'left'": (CART, {"reset": "left"}),
+    "reset must be keyframes that leave mocap bodies .* got 'left'": (
+        CART.replace("<worldbody>", '<worldbody><body mocap="true"/>').replace(
+            'name="left"', 'name="left" mpos="1 2 3"'
+        ),
+        {"reset": ("right", "left")},
+    ),
     'backend must be "mujoco" or "mjx", got \'warp\'': (CART, {"backend": "warp"}),
     "names of coordinates must differ": (CART, {"observe": ["qpos", "qpos"]}),
     "MJX lacks what this model uses": (
@@ -254,5 +280,9 @@ def test_a_start_of_the_wrong_size_is_refused(key):
     env = mujoco_env(CART, reset=lambda key: (jnp.zeros(3), jnp.zeros(2)))
     with pytest.raises(ValueError, match=r"the qpos of reset must be float32\[2\]"):
         env.reset(key)
+    for drawn, said in ((jnp.zeros(2), "ArrayImpl"), ((1, 2, 3), "3 of them")):
+        env = mujoco_env(CART, reset=lambda key, drawn=drawn: drawn)
+        with pytest.raises(TypeError, match=f"return .qpos, qvel., got {said}"):
+            env.reset(key)
     with pytest.raises(ValueError, match=r"action must be float32\[1\]"):
         env.step(mujoco_env(CART).reset(key), jnp.zeros(2))

@@ -75,9 +75,17 @@ def test_what_it_passes_on_is_heeded():
         ({"angle": "qpos/hing"}, "qpos/hinge"),
         ({"axes": (("speed", "m/s", "qvel", 1.0),) * 2}, "'qvel'"),
         ({"backend": "other"}, "backend must be"),
+        ({"name": 3}, "name must be a text, got 3"),
+        ({"tasks": {"fast": 1}}, "tasks must be a function, got {'fast': 1}"),
+        ({"axes": AXES[:1]}, "axes must be two of .name, unit, entry, end., got"),
+        ({"axes": AXES[0][:2]}, "an axis must be .*, end., got 'speed'"),
+        ({"axes": (AXES[0], AXES[1][:3])}, "an axis must be .name, unit, entry, end."),
+        ({"axes": (AXES[0], (*AXES[1][:3], "1"))}, "end of an axis must be a P"),
+        ({"axes": (AXES[0], (*AXES[1][:3], 0.0))}, "end of an axis must be above"),
+        ({"camera": "side"}, "camera must be one of the model, .., got 'side'"),
     ],
 )
 def test_what_cannot_be_is_refused(wrong, said):
-    given = {"tasks": tasks, **wrong}
-    with pytest.raises(ValueError, match=said):
-        mujoco_robot("cart", robots.CART_XML, **given)
+    given = {"name": "cart", "tasks": tasks, **wrong}
+    with pytest.raises((TypeError, ValueError), match=said):
+        mujoco_robot(model=robots.CART_XML, **given)

@@ -116,6 +116,8 @@ def test_unknown_names_are_answered_with_near_ones(name):
 def test_nothing_to_observe_is_refused():
     with pytest.raises(TypeError, match="observe must be a sequence of names, got 'q'"):
         readings(FREE, "q")
+    with pytest.raises(TypeError, match="observe must be a sequence of names, got 3"):
+        readings(FREE, 3)
     with pytest.raises(ValueError, match="observe must name an entry of the model"):
         readings(FREE, [])
 

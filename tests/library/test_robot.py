@@ -59,3 +59,13 @@ def test_what_is_no_robot_is_refused():
         envs.make("pets/half_cheetah", backend=3)
     with pytest.raises(ValueError, match="rewards must have a task, got none"):
         envs.tasks_of({})
+    with pytest.raises(TypeError, match=r"name must be a text, got 3 \(int\)"):
+        envs.make(3)
+    with pytest.raises(TypeError, match="rewards must be functions by name, got list"):
+        envs.tasks_of([height])
+    with pytest.raises(TypeError, match="a name of rewards must be a text, got 1"):
+        envs.tasks_of({1: height})
+    with pytest.raises(ValueError, match="a name of rewards must not be empty"):
+        envs.tasks_of({"": height})
+    with pytest.raises(TypeError, match=r"rewards\['high'\] must be a function, got 2"):
+        envs.tasks_of({"high": 2})
