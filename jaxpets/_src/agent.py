@@ -17,7 +17,7 @@ from jaxpets._src.checks import check_count, check_record
 from jaxpets._src.ensemble import Ensemble, params_check
 from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.fit_records import FitMetrics, Fitter
-from jaxpets._src.learner import LearnerState, RewardData
+from jaxpets._src.learner import LearnerState, RewardData, check_reward_data
 from jaxpets._src.types import Planner, PlanParams
 
 _NO_DATA = RewardData()
@@ -84,7 +84,7 @@ def agent(
     check_record("model", model, Ensemble)
     check_record("fitter", fitter, Fitter)
     check_record("random_planner", random_planner, Planner)
-    check_record("reward_data", reward_data, RewardData)
+    check_reward_data(reward_data)
     check_count("capacity", capacity)
     check_count("seed", seed, minimum=0)
     if num_envs is not None:
@@ -164,7 +164,7 @@ class Agent:
           planner: plans for the task; None for the one that explores.
 
         Raises:
-          TypeError: if planner is none.
+          TypeError: if planner is none, or reward holds what is no number.
         """
         check_record("planner", planner or self._planner, Planner)
         self._task = (planner or self._planner, computed.strongly_typed(reward))

@@ -122,10 +122,16 @@ def first_state(planner: Planner, lead: tuple[int, ...], places: Places) -> Any:
 
 
 def strongly_typed(tree: Any) -> Any:
-    """Returns numbers as arrays of their own type: one of Python would compile anew."""
+    """Returns numbers as arrays of their own type: one of Python would compile anew.
+
+    Raises:
+      TypeError: for what is none, as a reward's function in place of its data.
+    """
 
     def array(leaf: Any) -> Array:
         dtype = leaf.dtype if isinstance(leaf, Array) else np.asarray(leaf).dtype
+        if dtype.kind in "OUS":
+            raise TypeError(f"reward must be a pytree of numbers, got {leaf!r} in it.")
         return jnp.asarray(leaf, jax.dtypes.canonicalize_dtype(dtype))
 
     return jax.tree.map(array, tree)

@@ -10,6 +10,8 @@ from jaxpets._src.types import Transition
 
 AUTORESETS = ("Disabled", "NextStep", "SameStep")
 
+_NO_REALS = "USc"  # kinds of dtypes that NumPy would make floats of: text and complex
+
 
 class World(NamedTuple):
     """Shapes of one world, or of N that are stepped together.
@@ -56,8 +58,11 @@ def numbers(world: World, name: str, value: Any) -> np.ndarray:
     """
     shape = (*world.lead, world.obs_size)
     try:
+        given = np.asarray(value)
+        if value is None or given.dtype.kind in _NO_REALS:  # None would be NaN
+            raise TypeError
         with np.errstate(over="ignore"):  # what is too large is refused below
-            array = np.array(value, np.float32)
+            array = np.array(given, np.float32)
     except (TypeError, ValueError) as error:
         kind = type(value).__name__
         raise TypeError(

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxpets._src.checks import check_array, check_count, check_record
+from jaxpets._src.checks import check_array, check_count, check_real, check_record
 from jaxpets._src.types import ModelSpace
 
 
@@ -30,6 +30,7 @@ def check_space(
       TypeError, ValueError: naming the entry that is wrong, and by how much.
     """
     check_record("space", space, ModelSpace)
+    check_real("tolerance", tolerance, 0.0)
     check_array("obs", obs, ["T", "D"])
     check_array("next_obs", next_obs, list(jnp.shape(obs)))
     num_rows, obs_size = jnp.shape(obs)

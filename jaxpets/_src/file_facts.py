@@ -30,6 +30,18 @@ def metadata(kind: str, texts: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
+def about_of(about: Any) -> dict[str, Any]:
+    """Returns what a user says of a file, by name.
+
+    Raises:
+      TypeError: if it is no mapping.
+    """
+    if not isinstance(about, Mapping | None):
+        kind = type(about).__name__
+        raise TypeError(f"about must be a mapping, got {about!r} ({kind}).")
+    return dict(cast(Mapping[str, Any], about or {}))
+
+
 def check_format(file: tensor_file.TensorFile, *kinds: str) -> None:
     """Refuses a file of none of these kinds, or of a later version."""
     wanted = [f"jaxpets {kind}" for kind in kinds]

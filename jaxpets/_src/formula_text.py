@@ -66,9 +66,20 @@ def names(
     Returns:
       Words and the places of their entries, in the order given.
 
+    Raises:
+      ValueError: if an alias is of an entry that is none; the last would be read for
+        it, without a word.
+
     >>> names([Coordinate("qvel/rootx"), Coordinate("qpos/root.z")], {"velocity": 0})
     {'qvel_rootx': 0, 'qpos_root_z': 1, 'velocity': 0}
     """
+    for alias, place in (aliases or {}).items():
+        check_count(f"aliases[{alias!r}]", place, minimum=0)
+        if place >= len(coordinates):
+            raise ValueError(
+                f"aliases[{alias!r}] must be one of {len(coordinates)} entries, "
+                f"got {place}."
+            )
     found: dict[str, int] = {}
     entries = [(row.name, i) for i, row in enumerate(coordinates)]
     for name, place in [*entries, *(aliases or {}).items()]:

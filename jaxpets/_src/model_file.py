@@ -72,7 +72,7 @@ def save_model(
         "action_size": model.action_size,
         "space": file_facts.space_to_json(space),
     }
-    texts = {"model": facts, "about": dict(about or {})}
+    texts = {"model": facts, "about": file_facts.about_of(about)}
     metadata = file_facts.metadata(_KIND, texts)
     tensor_file.write(path, arrays, metadata)
 

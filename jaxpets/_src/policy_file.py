@@ -64,7 +64,7 @@ def save_policy(
         "action_low": np.asarray(box.low).tolist(),
         "action_high": np.asarray(box.high).tolist(),
     }
-    texts = {_KIND: facts, "about": dict(about or {})}
+    texts = {_KIND: facts, "about": file_facts.about_of(about)}
     tensor_file.write(path, arrays, file_facts.metadata(_KIND, texts))
 
 

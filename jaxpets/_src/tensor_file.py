@@ -50,9 +50,14 @@ def write(
       metadata: texts by name.
 
     Raises:
-      ValueError: for an array of another dtype.
+      FileNotFoundError: if its folder is not there.
+      TypeError, ValueError: for a path that is none, or an array of another dtype.
     """
-    target = Path(path)
+    target = _path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(
+            f"path must be in a folder that is there, but {target.parent} is none."
+        )
     rows = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     for name, row in rows.items():
         if str(row.dtype) not in _DTYPES.values():
@@ -70,9 +75,10 @@ def read(path: str | os.PathLike[str]) -> TensorFile:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is no safetensors file, or has arrays of another dtype.
+      TypeError, ValueError: if path is none, it is no safetensors file, or has arrays
+        of another dtype.
     """
-    source = Path(path)
+    source = _path(path)
     if not source.is_file():
         raise FileNotFoundError(f"path must be a file, but {source} is none.")
     shapes: dict[str, tuple[int, ...]] = {}
@@ -94,6 +100,13 @@ def named(tree: Any) -> dict[str, Any]:
     """Returns the leaves of a pytree by their places in it, in its order."""
     leaves = cast(list[Any], jax.tree_util.tree_leaves_with_path(tree))
     return {jax.tree_util.keystr(p, simple=True, separator="."): x for p, x in leaves}
+
+
+def _path(path: Any) -> Path:
+    if not isinstance(path, (str, os.PathLike)):
+        kind = type(path).__name__
+        raise TypeError(f"path must be a text or a Path, got {path!r} ({kind}).")
+    return Path(cast(Any, path))
 
 
 def _opened(path: Path) -> Any:

@@ -275,6 +275,9 @@ def test_what_a_world_may_not_say(make, trained):
     for bad, error, words in (
         ([0.0], ValueError, r"obs must be of shape \(2,\), got \(1,\)"),
         ({"x": 0}, TypeError, r"obs must be numbers of shape \(2,\), got dict"),
+        (["1", "2"], TypeError, r"obs must be numbers of shape \(2,\), got list"),
+        (np.ones(2) * 1j, TypeError, "obs must be numbers of shape .* got ndarray"),
+        (None, TypeError, r"obs must be numbers of shape \(2,\), got NoneType"),
         ([0.0, np.nan], ValueError, r"obs must be finite, got nan in entry \[1\]"),
         ([1e300, 0.0], ValueError, r"obs must be finite, got inf in entry \[0\]"),
     ):
@@ -331,6 +334,11 @@ def test_what_an_agent_may_not_be_made_of(make, parts):
         make(params=jax.jit(toys.small_ensemble(obs_size=3).init)(jax.random.key(0)))
     with pytest.raises(TypeError, match="planner must be a Planner"):
         make().perform((), 3)
+    for reward in (toys.reach, "up", {"goal": object()}):
+        with pytest.raises(TypeError, match="reward must be a pytree of numbers, got"):
+            make().perform(reward)
+    with pytest.raises(TypeError, match=r"reward_data.init must be a function, got A"):
+        make(reward_data=jaxpets.RewardData(jax.numpy.ones(2)))
 
 
 def test_only_counted_rows_are_appended():

@@ -97,6 +97,8 @@ def test_what_is_no_space_or_no_data_is_refused():
         jaxpets.check_space(SPACE, DATA.obs[0], DATA.next_obs[0])
     with pytest.raises(ValueError, match=r"next_obs must be float32\[30, 2\], got"):
         jaxpets.check_space(SPACE, DATA.obs, DATA.next_obs[:3])
+    with pytest.raises(ValueError, match="tolerance must be finite and at least 0"):
+        jaxpets.check_space(SPACE, *DATA[::2], tolerance=float("nan"))
     with pytest.raises(ValueError, match=r"obs must be float32\[T, D\], got int32"):
         rows = np.zeros((3, 2), np.int32)
         jaxpets.check_space(SPACE, rows, rows)

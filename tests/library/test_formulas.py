@@ -253,6 +253,13 @@ def test_other_arguments_are_checked():
         formulas.parse("1", {}, -1)
     with pytest.raises(ValueError, match="'x'"):
         formulas.parse("x", {"x": -1})
+    rows = [Coordinate("a"), Coordinate("b")]
+    with pytest.raises(ValueError, match=r"aliases\['x'\] must be one of 2 .* got 2"):
+        formulas.names(rows, {"x": 2})
+    with pytest.raises(
+        TypeError, match=r"aliases\['x'\] must be a Python int, got 'a'"
+    ):
+        formulas.names(rows, {"x": "a"})
     with pytest.raises(TypeError, match="formula must be a Formula, got str"):
         formulas.reward("velocity", OBS, ACTION, NEXT_OBS)
 

@@ -161,6 +161,13 @@ def test_bad_settings_fail_when_built(key):
         LEARNER.init(jax.random.PRNGKey(0))
 
 
+def test_reward_data_are_of_functions():
+    with pytest.raises(
+        TypeError, match=r"reward_data.refresh must be a function, got 3"
+    ):
+        build(jaxpets.RewardData(refresh=3))
+
+
 def test_reward_data_that_change_shape_fail_when_traced(key):
     """They would retrace every trial, and fail to be restored."""
     growing = RewardData(

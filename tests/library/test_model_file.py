@@ -105,6 +105,12 @@ def test_what_cannot_be_saved_is_said(model, params, tmp_path):
         jaxpets.save_model(path, model, bad)
     with pytest.raises(ValueError, match="params"):
         jaxpets.save_model(path, model, params._replace(scaler=()))
+    with pytest.raises(TypeError, match=r"about must be a mapping, got 'a note' .str"):
+        jaxpets.save_model(path, model, params, about="a note")
+    with pytest.raises(TypeError, match="path must be a text or a Path, got None"):
+        jaxpets.save_model(None, model, params)
+    with pytest.raises(FileNotFoundError, match=r"path must be in a folder .*, but "):
+        jaxpets.save_model(tmp_path / "no" / "m", model, params)
     assert not path.exists()
 
 
@@ -209,6 +215,8 @@ def test_what_is_no_safetensors_is_refused(saved, tmp_path):
             jaxpets.load_model(path)
     with pytest.raises(FileNotFoundError, match="path must be a file"):
         jaxpets.load_model(tmp_path / "none")
+    with pytest.raises(TypeError, match="path must be a text or a Path, got 3"):
+        jaxpets.load_model(3)
 
 
 def test_only_what_can_be_read_is_written(tmp_path):
