@@ -53,7 +53,8 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
 
     How a model sees an entry follows from what it is: a hinge without limits is an
     angle, a ball is a quaternion, so is a free joint behind its place. What depends on
-    where the robot stands is neither read by the network nor bounded. A velocity over a
+    where the robot stands is neither read by the network nor bounded. A sensor of a
+    joint's position or of a place is seen as that position or place. A velocity over a
     step and a sensor of forces are predicted as they are and not read, everything else
     by its change.
 
@@ -119,7 +120,9 @@ def _groups(model: Any, shifts: set[int]) -> dict[str, list[Reading]]:
         "qpos": qpos,
         "qvel": qvel,
         "act": [r for i in range(model.nu) for r in _activations(model, i)],
-        "sensordata": [r for i in range(model.nsensor) for r in _sensor(model, i)],
+        "sensordata": [
+            r for i in range(model.nsensor) for r in _sensor(model, i, shifts)
+        ],
         "site_xpos": _points(model, "site_xpos", "SITE", range(model.nsite), shifts),
         "xpos": _points(model, "xpos", "BODY", bodies, shifts),
         "xipos": _points(model, "xipos", "BODY", bodies, shifts),
@@ -185,11 +188,20 @@ def _activations(model: Any, actuator: int) -> list[Reading]:
     return [Reading("act", start + i, Coordinate(n)) for i, n in enumerate(names)]
 
 
-def _sensor(model: Any, sensor: int) -> list[Reading]:
+def _sensor(model: Any, sensor: int, shifts: set[int]) -> list[Reading]:
+    """Returns what a sensor says, seen as what it is of where that has a name too."""
+    kind, types = _C.mjtSensor(model.sensor_type[sensor]), _C.mjtSensor
+    no_frame = model.sensor_reftype[sensor] == int(_C.mjtObj.mjOBJ_UNKNOWN)
+    in_world = kind in (types.mjSENS_FRAMEPOS, types.mjSENS_SUBTREECOM) and no_frame
     name = f"sensordata/{_name(model, 'SENSOR', sensor)}"
     start, size = int(model.sensor_adr[sensor]), int(model.sensor_dim[sensor])
     if model.sensor_datatype[sensor] == int(_C.mjtDataType.mjDATATYPE_QUATERNION):
         rows = [_unit(f"{name}.{part}") for part in _WXYZ]
+    elif kind == types.mjSENS_JOINTPOS:
+        joint = int(model.sensor_objid[sensor])
+        rows = [_positions(model, joint, shifts)[0].coordinate._replace(name=name)]
+    elif in_world:
+        rows = [_place(name, axis, shifts) for axis in _XYZ]
     else:
         # Forces and accelerations jump, so that their last value says little.
         jumps = model.sensor_needstage[sensor] == int(_C.mjtStage.mjSTAGE_ACC)
@@ -207,11 +219,14 @@ def _points(
     found: list[Reading] = []
     for thing in things:
         for i, axis in enumerate(_XYZ):
-            here = not shifts or axis == "z"
-            name = f"{source}/{_name(model, kind, thing)}.{axis}"
-            row = Coordinate(name, "relative", here, here)
+            row = _place(f"{source}/{_name(model, kind, thing)}", axis, shifts)
             found.append(Reading(source, len(_XYZ) * thing + i, row))
     return found
+
+
+def _place(name: str, axis: str, shifts: set[int]) -> Coordinate:
+    here = not shifts or axis == "z"
+    return Coordinate(f"{name}.{axis}", "relative", here, here)
 
 
 def _arrays(

@@ -57,6 +57,33 @@ def test_what_follows_from_where_the_robot_stands_is_not_read():
     assert rows(held, "site_xpos/tip.x")["site_xpos/tip.x"].coordinate.is_input
 
 
+def test_a_sensor_is_seen_as_what_it_is_of():
+    sensors = """
+      <framepos name="at" objtype="site" objname="eye"/>
+      <framepos name="from" objtype="site" objname="foot" reftype="body" refname="leg"/>
+      <subtreecom name="middle" body="torso"/>
+      <jointpos name="turn" joint="wheel"/>
+    """
+    wheel = '<body><joint name="wheel" axis="0 1 0"/><geom size="0.02"/></body></body>'
+    bodies = robots.FLOOR + robots.FREE.rstrip().removesuffix("</body>") + wheel
+    model = robots.compiled(bodies, f"<sensor>{sensors}</sensor>" + robots.HIP)
+    found = {name: r.coordinate for name, r in rows(model, "sensordata").items()}
+    for name in ("at", "middle"):
+        seen = [found[f"sensordata/{name}.{axis}"][1:] for axis in "xyz"]
+        unread, read = ("relative", False, False), ("relative", True, True)
+        assert seen == [unread, unread, read]
+    assert found["sensordata/from.x"][1:] == ("relative", True, True)
+    assert found["sensordata/turn"][1:] == ("angle", True, False)
+    rail = robots.CART_XML.replace(
+        "</mujoco>", '<sensor><jointpos name="s" joint="slider"/></sensor></mujoco>'
+    )
+    for push, free in (("slider", False), ("hinge", True)):
+        driven = rail.replace('name="push" joint="slider"', f'joint="{push}"')
+        model = mujoco.MjModel.from_xml_string(driven)
+        row = rows(model, "sensordata/s")["sensordata/s"].coordinate
+        assert row[1:] == ("relative", not free, not free)
+
+
 def test_places_are_those_of_mujoco():
     data = mujoco.MjData(FREE)
     data.qpos[:] += np.random.default_rng(0).normal(size=FREE.nq)
