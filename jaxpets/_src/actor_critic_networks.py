@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxpets._src.action_box import ActionBox
 from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
-from jaxpets._src.checks import check_record
+from jaxpets._src.checks import check_callable, check_record
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Head
 from jaxpets._src.types import (
@@ -56,6 +56,8 @@ def build_networks(
     """
     check_record("space", space, ModelSpace)
     check_record("goals", goals, Goals)
+    for name, function in goals._asdict().items():
+        check_callable(f"goals.{name}", function)
     actor = Head(hidden_size, box.center.shape[0])
     critic = Head(hidden_size, 1)
     propose = cast(Callable[[Any, Array], Array], actor.apply)
@@ -121,7 +123,11 @@ def guided_reward(reward_fn: RewardFn) -> RewardFn:
     Returns:
       The same reward, whose data are `Guided.reward`. It raises a TypeError for what is
       not Guided.
+
+    Raises:
+      TypeError: if reward_fn is no function.
     """
+    check_callable("reward_fn", reward_fn)
 
     def reward(data: Guided, obs: Array, action: Array, next_obs: Array) -> Array:
         check_record("params.reward", data, Guided)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_key, check_record
+from jaxpets._src.checks import check_key, check_record, is_sequence
 from jaxpets._src.types import Coordinate, Env, EnvState, RolloutFn
 
 _KEPT = ("reward", "done")
@@ -53,9 +53,12 @@ def from_brax(env: BraxEnv, *, keep: Sequence[str] = ()) -> Env:
       with the change as what is predicted.
 
     Raises:
-      TypeError, ValueError: if `keep` has another word, or the observation is not a
-        vector.
+      TypeError, ValueError: if env is none of theirs, `keep` has another word, or the
+        observation is not a vector.
     """
+    if not hasattr(env, "action_size"):
+        kind = type(env).__name__
+        raise TypeError(f"env must be of Brax, with an action_size, got {kind}.")
     kept = _checked_keep(keep)
     one = jnp.ones((env.action_size,), jnp.float32)
 
@@ -94,7 +97,7 @@ def _is_done(obs: Array) -> Array:
 
 def _checked_keep(keep: Sequence[str]) -> list[str]:
     """Returns what is kept in the order in which it is observed."""
-    if isinstance(keep, str) or not set(keep) <= set(_KEPT):
+    if not is_sequence(keep) or not all(name in _KEPT for name in keep):
         raise ValueError(f'keep must be among ("reward", "done"), got {keep!r}.')
     return [name for name in _KEPT if name in keep]
 

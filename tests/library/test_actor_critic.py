@@ -316,6 +316,7 @@ def test_steps_that_are_not_finite_are_dropped():
         (dict(trace=1.5), ValueError, r"trace must be in \[0, 1\], got 1.5"),
         (dict(horizon=0), ValueError, "horizon must be at least 1, got 0"),
         (dict(goals=3), TypeError, "goals must be a Goals, got"),
+        (dict(goals=Goals(3)), TypeError, r"goals.draw must be a function, got 3"),
         (dict(num_members=0), ValueError, "num_members must be at least 1, got 0"),
         (dict(dynamics_fn=None), TypeError, "dynamics_fn must be a function, got None"),
         (dict(terminal_fn=1), TypeError, "terminal_fn must be a function, got 1"),

@@ -119,11 +119,13 @@ def test_from_brax_runs_in_our_planner(pendulum, key):
     assert jnp.abs(angle).max() < 0.2  # rad; Brax calls more a fall
 
 
-@pytest.mark.parametrize("keep", ["done", ("reward", "cost")])
+@pytest.mark.parametrize("keep", ["done", ("reward", "cost"), 3, [[]]])
 def test_from_brax_keeps_no_more_than_there_is(keep):
     fake = SimpleNamespace(action_size=1)
     with pytest.raises(ValueError, match=r'keep must be among .*"done".*, got '):
         from_brax(fake, keep=keep)
+    with pytest.raises(TypeError, match=r"env must be of Brax, .* got str"):
+        from_brax("ant")
 
 
 def test_from_brax_refuses_observations_that_are_no_vector(key):

@@ -16,6 +16,7 @@ from jaxpets.envs import env_rollout, from_brax
 from jaxpets.envs import half_cheetah as hc
 from jaxpets.models import without_noise
 from jaxpets.optimizers import sharded
+from jaxpets.policies import guided_reward
 
 ENV = toys.cart_env()
 MODEL = toys.small_ensemble(num_members=2, hidden_sizes=(4,), weight_decays=1e-4)
@@ -189,6 +190,8 @@ WRONG = {
         "state must have the structure"),
     "dataset None in fit": (
         lambda: FITTER.step(PARAMS, KEY, FIT, None), "dataset must be a Dataset"),
+    "guided_reward of no function": (
+        lambda: guided_reward(3), "reward_fn must be a function, got 3"),
     "without_noise of no model": (
         lambda: without_noise(None), "params must be an EnsembleParams"),
     "without_noise of a model of another kind": (
