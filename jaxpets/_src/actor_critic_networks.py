@@ -95,6 +95,7 @@ def build_networks(
     def decide(data: Guided, obs: Array) -> tuple[Array, Array]:
         check_record("params.reward", data, Guided)
         params = data.networks
+        check_record("params.reward.networks", params, ActorCriticParams)
         seen = see(params, goals.features(data.reward), obs)
         action = jnp.tanh(propose(params.actor, seen))
         value = jnp.mean(judge(params.critics, seen, action), axis=0) / params.scale

@@ -89,7 +89,7 @@ def fused_rollout(
       observation more than 256 entries, or features and action together more than 512.
 
     Any number of members, particles, candidates, steps and hidden layers will do, and
-    any nest of up to four `jax.vmap`.
+    any nest of up to four `jax.vmap`. A kernel has no gradient; `particle_rollout` has.
 
     Args:
       model: as `jaxpets.ensemble` built it. The kernel is made from its config and

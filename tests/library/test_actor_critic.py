@@ -368,3 +368,8 @@ def test_wrong_arguments_fail_when_traced():
         learner.init(WORLD, jax.random.key(0), states())
     with pytest.raises(TypeError, match=r"params.reward must be a Guided"):
         learner.policy.step(params, jax.random.key(0), (), jnp.zeros(2))
+    swapped = params._replace(reward=Guided((), params.reward))
+    with pytest.raises(
+        TypeError, match=r"reward.networks must be an ActorCriticParams"
+    ):
+        learner.policy.step(swapped, jax.random.key(0), (), jnp.zeros(2))
