@@ -199,6 +199,13 @@ def test_a_keyframe_says_what_the_actuators_hold(backend, key):
     np.testing.assert_array_equal(right.physics.act, [0.0])
 
 
+def test_a_keyframe_may_say_where_a_mocap_body_is_in_rounded_numbers():
+    mark = '<worldbody><body mocap="true" pos="0.1234567 0 0" quat="1 1 0 0"/>'
+    said = 'name="left" mpos="0.12346 0 0" mquat="0.7071 0.7071 0 0"'
+    xml = CART.replace("<worldbody>", mark).replace('name="left"', said)
+    assert mujoco_env(xml, reset=("left",)).action_low.shape == (1,)
+
+
 def test_a_start_may_be_of_numpy(key):
     def own(key):
         del key
