@@ -112,7 +112,7 @@ def check_explored(config: Config, explored: Config) -> None:
             if (own := f"{phase}.{entry.name}") in names:
                 valid = f"{valid}; {flag(own)} is meant here"
         elif Mark.EXPLORED in entry.marks:
-            valid = f"{found}, as in the exploration run"
+            valid = f"{found}, which goes with what --from names"
         else:
             continue
         require(given == found, flag(entry.name), given, valid)

@@ -17,7 +17,7 @@ from jaxpets._src.checks import (
     check_record,
     check_scalar,
 )
-from jaxpets._src.elites import join_iterations, select_elites
+from jaxpets._src.elites import check_elites, join_iterations, select_elites
 from jaxpets._src.types import (
     Candidates,
     ObjectiveFn,
@@ -97,8 +97,7 @@ def cem(
     """
     check_count("horizon", horizon)
     box = action_box(action_low, action_high)
-    check_count("num_elites", num_elites, minimum=2)
-    check_count("num_samples", num_samples, minimum=num_elites)
+    check_elites(num_samples, num_elites)
     check_count("num_iterations", num_iterations)
     momentum = check_scalar("momentum", momentum, 0.0, 1.0)
     min_variance = check_scalar("min_variance", min_variance, 0.0)

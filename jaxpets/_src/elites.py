@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.checks import check_count
+
 # The value of a candidate whose return is not finite. Finite itself, so that means
 # over elites stay finite, and far below any return a task can give.
 WORST_VALUE = -1e30
@@ -25,6 +27,16 @@ class Elites(NamedTuple):
     mean: Array
     variance: Array
     value: Array
+
+
+def check_elites(num_samples: int, num_elites: int) -> None:
+    """Raises unless there are two elites at least, and no fewer samples."""
+    check_count("num_elites", num_elites, minimum=2)
+    check_count("num_samples", num_samples)
+    if num_samples < num_elites:
+        raise ValueError(
+            f"num_samples must be at least num_elites, {num_elites}, got {num_samples}."
+        )
 
 
 def join_iterations(tried: Any) -> Any:

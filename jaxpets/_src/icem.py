@@ -17,7 +17,7 @@ from jaxpets._src.checks import (
     check_record,
     check_scalar,
 )
-from jaxpets._src.elites import join_iterations, select_elites
+from jaxpets._src.elites import check_elites, join_iterations, select_elites
 from jaxpets._src.types import (
     Candidates,
     ObjectiveFn,
@@ -104,8 +104,7 @@ def icem(
     """
     check_count("horizon", horizon)
     box = action_box(action_low, action_high)
-    check_count("num_elites", num_elites, minimum=2)
-    check_count("num_samples", num_samples, minimum=num_elites)
+    check_elites(num_samples, num_elites)
     check_count("num_iterations", num_iterations)
     momentum, noise_beta, init_std = _numbers(
         momentum, noise_beta, init_std, kept_fraction, decay

@@ -212,7 +212,9 @@ def test_a_model_plans_with_its_own_activation(tmp_path, capsys):
     assert ensemble_config(config.model).activation == "tanh"
     assert model.config.activation == "tanh"
     assert main([*command, "--model.activation", "relu"]) == 2
-    assert "it must be tanh, as in the exploration run" in capsys.readouterr().err
+    assert (
+        "it must be tanh, which goes with what --from names" in capsys.readouterr().err
+    )
 
 
 def test_a_model_in_other_coordinates_than_the_robots_is_refused(tmp_path, capsys):

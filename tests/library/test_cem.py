@@ -226,7 +226,7 @@ def test_few_left_of_many_rejected_make_the_plan():
     [
         (dict(horizon=0), "horizon must be at least 1, got 0"),
         (dict(num_elites=1), "num_elites must be at least 2, got 1"),
-        (dict(num_samples=5), "num_samples must be at least 6, got 5"),
+        (dict(num_samples=5), "num_samples must be at least num_elites, 6, got 5"),
         (dict(num_iterations=0), "num_iterations must be at least 1, got 0"),
         (dict(momentum=1.5), r"momentum must be in \[0, 1\], got 1.5"),
         (dict(min_variance=-1.0), "min_variance must be finite and .* got -1.0"),

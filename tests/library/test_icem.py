@@ -220,7 +220,7 @@ def test_first_state_holds_the_middle_of_the_box():
     [
         (dict(horizon=0), "horizon must be at least 1, got 0"),
         (dict(num_elites=1), "num_elites must be at least 2, got 1"),
-        (dict(num_samples=7), "num_samples must be at least 8, got 7"),
+        (dict(num_samples=7), "num_samples must be at least num_elites, 8, got 7"),
         (dict(num_iterations=0), "num_iterations must be at least 1, got 0"),
         (dict(momentum=-0.1), r"momentum must be in \[0, 1\], got -0.1"),
         (dict(noise_beta=-1.0), "noise_beta must be finite and .* got -1.0"),
