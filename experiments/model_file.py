@@ -140,12 +140,16 @@ def robot_of(model: Model, said: str, env: str | None) -> str:
     """Returns of which robot a model is: what the command line says, or the file.
 
     Raises:
-      UsageError: if neither says, or the robot is of a file that only the model names.
+      UsageError: if neither says, or the robot is of a file that only the model names,
+        or that it does not name.
     """
     name = env or model.about.get("environment")
     if not isinstance(name, str):
         raise UsageError(f"--env is missing; {said} does not say of which robot it is.")
     user_files.check_named("--env", env, name, model.path)
+    if env is None and "/" not in name:  # all names of the library's have one
+        own = f"{said} is of {name}, which is no robot of the library"
+        raise UsageError(f"--env is missing; {own}. Name the file that makes it.")
     return name
 
 

@@ -141,6 +141,7 @@ def again(file, path, **changes):
     ("changes", "code", "words"),
     [
         ({"environment": None}, 2, "does not say of which robot it is"),
+        ({"environment": "cart"}, 2, "is of cart, which is no robot of the library"),
         ({"environment": "gym/Ant-v5"}, 2, "is of another robot"),
         ({"environment": "evil.py"}, 2, "runs only if you name it: --env evil.py"),
         ({"training": {"arm": "evil.py:arm"}}, 2, "you name it: --arm evil.py:arm"),
