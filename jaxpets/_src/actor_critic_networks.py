@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxpets._src.action_box import ActionBox
 from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
-from jaxpets._src.checks import check_callable, check_record
+from jaxpets._src.checks import check_callable, check_functions, check_record
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Head
 from jaxpets._src.types import (
@@ -55,9 +55,7 @@ def build_networks(
         goals.features does not return what the params are for.
     """
     check_record("space", space, ModelSpace)
-    check_record("goals", goals, Goals)
-    for name, function in goals._asdict().items():
-        check_callable(f"goals.{name}", function)
+    check_functions("goals", goals, Goals)
     actor = Head(hidden_size, box.center.shape[0])
     critic = Head(hidden_size, 1)
     propose = cast(Callable[[Any, Array], Array], actor.apply)

@@ -13,11 +13,11 @@ from jaxpets._src import agent_steps as computed
 from jaxpets._src import agent_world as told
 from jaxpets._src.agent_steps import ActFn, AgentSteps, act_fn, agent_steps
 from jaxpets._src.agent_world import World, autoreset_of
-from jaxpets._src.checks import check_count, check_record
+from jaxpets._src.checks import check_count, check_functions, check_record
 from jaxpets._src.ensemble import Ensemble, params_check
 from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.fit_records import FitMetrics, Fitter
-from jaxpets._src.learner import LearnerState, RewardData, check_reward_data
+from jaxpets._src.learner import LearnerState, RewardData
 from jaxpets._src.types import Planner, PlanParams
 
 _NO_DATA = RewardData()
@@ -84,7 +84,7 @@ def agent(
     check_record("model", model, Ensemble)
     check_record("fitter", fitter, Fitter)
     check_record("random_planner", random_planner, Planner)
-    check_reward_data(reward_data)
+    check_functions("reward_data", reward_data, RewardData)
     check_count("capacity", capacity)
     check_count("seed", seed, minimum=0)
     if num_envs is not None:

@@ -110,6 +110,13 @@ def check_callable(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be a function, got {value!r} ({kind}).")
 
 
+def check_functions(name: str, value: Any, kind: type) -> None:
+    """Raises unless `value` is a record of this kind, of functions alone."""
+    check_record(name, value, kind)
+    for field, function in value._asdict().items():
+        check_callable(f"{name}.{field}", function)
+
+
 def check_text(name: str, value: Any) -> None:
     """Raises unless `value` is a text that says something."""
     if not isinstance(value, str):

@@ -10,8 +10,8 @@ from jax import Array
 from jaxpets._src import dataset as datasets
 from jaxpets._src.action_box import action_box
 from jaxpets._src.checks import (
-    check_callable,
     check_count,
+    check_functions,
     check_key,
     check_like,
     check_record,
@@ -134,7 +134,7 @@ def learner(
     check_record("env", env, Env)
     check_record("ensemble", ensemble, Ensemble)
     check_record("fitter", fitter, Fitter)
-    check_reward_data(reward_data)
+    check_functions("reward_data", reward_data, RewardData)
     check_count("trial_length", trial_length)
     check_count("capacity", capacity, minimum=trial_length)
     box = action_box(env.action_low, env.action_high)
@@ -174,13 +174,6 @@ def learner(
         return state, TrialOutput(transitions, plans, metrics)
 
     return Learner(init, learn, step)
-
-
-def check_reward_data(reward_data: RewardData) -> None:
-    """Raises unless the data of a reward come of functions."""
-    check_record("reward_data", reward_data, RewardData)
-    for name, function in reward_data._asdict().items():
-        check_callable(f"reward_data.{name}", function)
 
 
 def _check_entries(env: Env, ensemble: Ensemble) -> None:

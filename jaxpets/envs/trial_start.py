@@ -71,9 +71,9 @@ def _check_mocap(model: Any, chosen: Sequence[int]) -> None:
     ids = model.body_mocapid
     bodies = [int(np.flatnonzero(ids == i)[0]) for i in range(model.nmocap)]
     place, turn = (x[bodies].ravel() for x in (model.body_pos, model.body_quat))
+    # Texts of keyframes are rounded, as MuJoCo's own are to six digits.
+    near = functools.partial(np.allclose, rtol=0.0, atol=_RESET_STD)
     for one in chosen:
-        # Texts of keyframes are rounded, as MuJoCo's own are to six digits.
-        near = functools.partial(np.allclose, rtol=0.0, atol=_RESET_STD)
         if not (near(model.key_mpos[one], place) and near(model.key_mquat[one], turn)):
             name = model.key(one).name
             raise ValueError(
