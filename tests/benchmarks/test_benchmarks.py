@@ -161,7 +161,16 @@ def test_agent(tmp_path):
     assert 0 < row["plan_ms"] <= row["plan_p99_ms"]
     assert 0 < row["act_ms"] <= row["act_p99_ms"]
     assert 0 < row["copied_ms"] <= row["copied_p99_ms"]
-    assert abs(row["added_ms"]) < row["act_p99_ms"]
+
+
+def test_agent_adds_the_median_of_the_differences_of_pairs(monkeypatch):
+    seconds = [(5e-3, 1e-3, 2e-3), (3e-3, 2e-3, 2e-3), (4e-3, 3e-3, 8e-3)]
+    monkeypatch.setattr(agent.timing, "in_turn", lambda *calls, repeats: seconds)
+    (row,) = agent.main(["--tiny", "--engine", "scan", "--repeats", "3"])
+    assert row["added_ms"] == pytest.approx(1)  # and not 4 - 2
+    assert (row["act_ms"], row["plan_ms"]) == pytest.approx((4, 2))
+    assert row["copied_ms"] == pytest.approx(2)
+    assert row["copied_p99_ms"] == pytest.approx(2 + 0.98 * 6)
 
 
 def test_agent_says_through_which_memory_an_action_came(monkeypatch):
