@@ -68,7 +68,7 @@ def append(
         rows = jnp.where(jnp.arange(length) < added, rows, capacity)
     data = Transition(
         *(
-            old.at[rows].set(new)
+            jnp.asarray(old).at[rows].set(new)
             for old, new in zip(dataset.data, transitions, strict=True)
         )
     )
@@ -103,7 +103,8 @@ def num_stable(transitions: Transition) -> Array:
     is_before = jax.lax.cummin(is_good.astype(jnp.int32), axis=is_good.ndim - 1) > 0
     # At the start of a trial, from rest, everything grows.
     is_stable = (next_obs <= 2.0 * obs) | (step == 0)
-    last = jnp.max(jnp.where(is_before & is_stable, step, -1), axis=-1)
+    # Of no rows at all, none.
+    last = jnp.where(is_before & is_stable, step, -1).max(axis=-1, initial=-1)
     return jnp.where(jnp.all(is_good, axis=-1), len(step), last + 1)
 
 
@@ -152,9 +153,15 @@ def _share(count: Array, part: Array, whole: Array) -> Array:
     return share
 
 
+def _check_dataset(dataset: Dataset) -> None:
+    """Raises unless this is one dataset: those of several seeds are to be mapped."""
+    check_record("dataset", dataset, Dataset)
+    check_array("dataset.data.obs", dataset.data.obs, ["C", "D"])
+
+
 def _check_rows(dataset: Dataset, transitions: Transition) -> None:
     """Raises unless rows of one length are what the dataset holds, and fit into it."""
-    check_record("dataset", dataset, Dataset)
+    _check_dataset(dataset)
     check_record("transitions", transitions, Transition)
     capacity, obs_size = dataset.data.obs.shape
     check_array("transitions.obs", transitions.obs, ["T", obs_size])
@@ -177,9 +184,10 @@ def grow(dataset: Dataset, capacity: int) -> Dataset:
       capacity: at least the present one.
 
     Raises:
-      TypeError, ValueError: if capacity is no integer, or smaller than it was.
+      TypeError, ValueError: if dataset is none, or one of several seeds, or capacity is
+        no integer, or smaller than it was.
     """
-    check_record("dataset", dataset, Dataset)
+    _check_dataset(dataset)
     old = dataset.data.obs.shape[0]
     check_count("capacity", capacity, minimum=old)
 
@@ -197,8 +205,12 @@ def obs_variance(dataset: Dataset) -> Array:
     """Returns the variance of the observations seen, `[D]` in units of obs squared.
 
     1 where there is none, as before any data. As the baseline variance of an
-    exploration reward it counts disagreement in units of what was seen.
+    exploration reward it counts disagreement in units of what was seen. Those of
+    several seeds are mapped, over AXES.
+
+    Raises:
+      TypeError, ValueError: if dataset is none, or one of several seeds.
     """
-    check_record("dataset", dataset, Dataset)
+    _check_dataset(dataset)
     _, std = moments(dataset.data.obs, dataset.size)
     return std**2

@@ -43,6 +43,7 @@ def visited_states(dataset: Dataset, num_states: int) -> VisitedStates:
     check_record("dataset", dataset, Dataset)
     check_count("num_states", num_states)
     obs = dataset.data.next_obs
+    check_array("dataset.data.next_obs", obs, ["C", "D"])
     mean, std = moments(obs, dataset.size)
     # Every row while they are few, then every so many-th.
     stride = jnp.maximum(dataset.size.astype(jnp.float32) / num_states, 1.0)

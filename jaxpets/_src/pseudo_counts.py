@@ -70,6 +70,7 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
     """
     check_record("dataset", dataset, Dataset)
     obs = dataset.data.next_obs
+    check_array("dataset.data.next_obs", obs, ["C", "D"])
     check_array("projection", projection, ["k", obs.shape[1]])
     if projection.shape[0] > _MAX_BITS:
         raise ValueError(

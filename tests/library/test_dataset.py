@@ -235,3 +235,35 @@ def test_the_variance_is_that_of_the_rows_that_are_there():
     dataset = append(dataset, numbered(8, 7))  # the oldest go
     want = np.arange(7.0, 15.0).var()
     np.testing.assert_allclose(obs_variance(dataset), [want, want], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        jaxpets.datasets.obs_variance,
+        lambda many: jaxpets.datasets.grow(many, 16),
+        lambda many: jaxpets.datasets.append(many, numbered(0, 2)),
+        lambda many: jaxpets.rewards.visited_states(many, 4),
+        lambda many: jaxpets.rewards.count_states(jnp.ones((3, 2)), many),
+    ],
+    ids=["obs_variance", "grow", "append", "visited_states", "count_states"],
+)
+def test_datasets_of_several_seeds_are_to_be_mapped(use):
+    """The variance of one seed's was ones, of the wrong shape, without a word."""
+    one = jaxpets.datasets.init(CAPACITY, 2, 1)
+    many = one._replace(data=jax.tree.map(lambda x: x[None], one.data))
+    with pytest.raises(ValueError, match=r"dataset.data.\w+ must be float32\[C, D\]"):
+        use(many)
+
+
+def test_a_dataset_of_numpy_grows_as_any_other():
+    """As one that was on the host, or in a file."""
+    dataset = append(jaxpets.datasets.init(CAPACITY, 2, 1), numbered(0, 3))
+    found = jaxpets.datasets.append(jax.device_get(dataset), numbered(3, 2))
+    assert held(found) == [0, 1, 2, 3, 4]
+
+
+def test_a_trial_without_steps_adds_none():
+    dataset = append(jaxpets.datasets.init(CAPACITY, 2, 1), numbered(0, 3))
+    assert num_stable(numbered(0, 0)) == 0
+    toys.assert_trees_close(append_stable(dataset, numbered(0, 0)), dataset)
