@@ -83,6 +83,13 @@ def keep_checked(
     object.__setattr__(config, name, check(name, getattr(config, name), *limits))
 
 
+def plain_number(value: Any) -> Any:
+    """Returns a number of NumPy, which the checks let in, as JSON can hold it."""
+    if isinstance(value, np.generic):
+        return cast(Any, value).item()
+    raise TypeError(f"{type(value).__name__} is nothing that JSON holds")
+
+
 def nearest(name: Any, names: Sequence[str]) -> list[str]:
     """Returns the up to three names that are most like what was given, if any is."""
     return difflib.get_close_matches(str(name), names, n=3, cutoff=0.4)

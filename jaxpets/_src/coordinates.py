@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_flag, check_record, nearest
+from jaxpets._src.checks import check_flag, check_record, nearest, plain_number
 from jaxpets._src.types import Coordinate, ModelSpace
 
 KINDS = ("relative", "absolute", "angle", "quaternion")
@@ -103,7 +103,8 @@ def table(coordinates: Sequence[Coordinate]) -> str:
 
 def to_json(coordinates: Sequence[Coordinate]) -> str:
     """Returns the entries as JSON, a list of objects with the fields of Coordinate."""
-    return json.dumps([row._asdict() for row in coordinates])
+    rows = [row._asdict() for row in coordinates]
+    return json.dumps(rows, default=plain_number)
 
 
 def from_json(text: str) -> tuple[Coordinate, ...]:

@@ -7,7 +7,7 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from jaxpets._src import coordinates, tensor_file
-from jaxpets._src.checks import check_count
+from jaxpets._src.checks import check_count, plain_number
 from jaxpets._src.ensemble import delta_space
 from jaxpets._src.types import ModelSpace
 
@@ -24,7 +24,7 @@ def metadata(kind: str, texts: Mapping[str, Any]) -> dict[str, str]:
     found = {"format": f"jaxpets {kind}", "version": str(_VERSION)}
     for name, value in texts.items():
         try:
-            found[name] = json.dumps(value, allow_nan=False)
+            found[name] = json.dumps(value, allow_nan=False, default=plain_number)
         except (TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"{name} must be JSON, but is not: {error}.") from error
     return found

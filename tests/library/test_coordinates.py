@@ -138,6 +138,11 @@ def test_a_table_goes_to_text_and_back():
     assert coordinates.table(()) == ""
 
 
+def test_a_flag_of_numpy_goes_to_text():
+    row = coordinates.Coordinate("x", is_input=np.bool_(True))
+    assert coordinates.from_json(coordinates.to_json([row])) == (row,)
+
+
 @pytest.mark.parametrize("text", ['{"a": 1}', '[{"name": "x"}]', "[1]"])
 def test_other_text_is_refused(text):
     with pytest.raises(ValueError, match="text must be a list of objects with name, k"):

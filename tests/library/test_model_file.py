@@ -53,6 +53,23 @@ def test_another_activation_comes_back(tmp_path):
     chex.assert_trees_all_equal(found, params)
 
 
+def test_numbers_of_numpy_are_saved_as_any_others(tmp_path):
+    """An obs_size is often `np.prod(space.shape)`."""
+    path = tmp_path / "m"
+    model = toys.small_ensemble(
+        obs_size=np.int64(2),
+        num_members=np.int64(2),
+        hidden_sizes=(np.int32(4),),
+        weight_decays=None,
+        bound_decay=np.float32(0.5),
+    )
+    about = {"trials": np.int64(3), "kept": np.bool_(True)}
+    jaxpets.save_model(path, model, jax.jit(model.init)(jax.random.key(1)), about=about)
+    again, _ = jaxpets.load_model(path)
+    assert again.config == model.config and again.obs_size == 2
+    assert models.about(path) == {"trials": 3, "kept": True}
+
+
 def test_half_the_room_is_a_rounding(model, params, saved, tmp_path):
     path = tmp_path / "half.safetensors"
     jaxpets.save_model(path, model, params, half=True)
