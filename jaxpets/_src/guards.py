@@ -23,7 +23,7 @@ def choose(condition: Array, new: Any, old: Any) -> Any:
 def guarded_step(
     update_fn: Callable[..., Any], grads: Any, params: Any, opt_state: Any
 ) -> tuple[Any, Any, Array]:
-    """Takes a gradient step, unless it is not finite.
+    """Takes a gradient step, unless it, or what the optimizer keeps, is not finite.
 
     Args:
       update_fn: of an optimizer of optax.
@@ -38,6 +38,8 @@ def guarded_step(
     with jax.numpy_dtype_promotion("standard"):
         updates, new_state = update_fn(grads, opt_state, params)
     new = jax.tree.map(jnp.add, params, updates)
-    good = is_finite(new)
+    # Of a gradient whose square is not finite, Adam makes a step of 0, and a moment
+    # that holds its weight where it is for ever.
+    good = is_finite((new, new_state))
     params, opt_state = choose(good, (new, new_state), (params, opt_state))
     return params, opt_state, good

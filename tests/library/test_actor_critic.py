@@ -13,6 +13,7 @@ import toys
 import jaxpets
 from jaxpets import PlanParams
 from jaxpets._src.actor_critic_update import lambda_returns
+from jaxpets._src.guards import guarded_step
 from jaxpets._src.imagined_trials import imagine
 from jaxpets.policies import (
     ActorCriticConfig,
@@ -307,6 +308,18 @@ def test_steps_that_are_not_finite_are_dropped():
     assert learned.metrics.num_skipped == NUM_UPDATES
     actors = (learned.before.params.actor, learned.after.params.actor)
     jax.tree.map(np.testing.assert_array_equal, *actors)
+
+
+def test_a_gradient_too_large_to_square_is_dropped():
+    """Adam's step of it is 0, but its moment would stay infinite, and the weight."""
+    adam, weights = optax.adam(1e-3), {"w": jnp.ones(3)}
+    state = adam.init(weights)
+    large = {"w": jnp.asarray([0.0, 1e25, 1.0], jnp.float32)}
+    *kept, good = guarded_step(adam.update, large, weights, state)
+    assert not good
+    toys.assert_trees_close(kept, [weights, state], rtol=0)
+    *_, good = guarded_step(adam.update, weights, weights, state)
+    assert good
 
 
 @pytest.mark.parametrize(
