@@ -63,7 +63,7 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
       dataset: its `next_obs` are the states.
 
     Returns:
-      PseudoCounts for `pseudo_count`.
+      PseudoCounts for `pseudo_count`; no state that is not finite is counted.
 
     Raises:
       ValueError: if the projection does not fit the observations or has over 32 rows.
@@ -77,12 +77,15 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
             f"projection must have at most {_MAX_BITS} rows, got {projection.shape[0]}."
         )
     mean, std = moments(obs, dataset.size)
-    used = jnp.arange(obs.shape[0]) < dataset.size
+    used = (jnp.arange(obs.shape[0]) < dataset.size) & jnp.all(
+        jnp.isfinite(obs), axis=1
+    )
+    num_used = jnp.sum(used, dtype=jnp.int32)
     codes = _hash(projection, mean, std, obs)
     # Padding sorts behind or among equal real codes, and is cut off when counting.
     codes = jnp.sort(jnp.where(used, codes, jnp.uint32(0xFFFFFFFF)))
     first, last = (
-        jnp.minimum(jnp.searchsorted(codes, codes, side=side), dataset.size)
+        jnp.minimum(jnp.searchsorted(codes, codes, side=side), num_used)
         for side in ("left", "right")
     )
     return PseudoCounts(projection, mean, std, codes, last - first)

@@ -63,6 +63,21 @@ def test_what_blew_up_is_not_new(bad):
     assert bonus[0] > 0 and np.isnan(bonus[1])
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_blew_up_is_not_counted(bad):
+    """Compared with anything it is no more, so it would have the code of no bits."""
+    states = clustered()
+    broken = np.zeros((7, D), np.float32)
+    broken[:, 2] = bad
+    projection = simhash(jax.random.key(0), 3, D)
+    want = count_states(projection, dataset_of(states))
+    got = count_states(projection, dataset_of(np.concatenate([broken, states])))
+    assert lookup(got, states).tolist() == lookup(want, states).tolist()
+    assert got.visits.max() == want.visits.max() and lookup(got, states[0]) > 0
+    zero = -jnp.linalg.pinv(projection).sum(1) * want.std + want.mean
+    assert lookup(got, zero) == lookup(want, zero)
+
+
 @pytest.mark.parametrize("num_bits", [1, 8, 16, 31, 32])
 def test_counts_sum_to_the_size(num_bits):
     states = clustered(seed=num_bits)
