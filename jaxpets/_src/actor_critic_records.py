@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 
 from jaxpets._src.checks import check_count, check_scalar, keep_checked
 from jaxpets._src.types import Dataset, Planner, PlanParams, RewardFn
@@ -50,8 +51,8 @@ class ActorCriticConfig:
         for name in ("discount", "trace", "restart", "target_rate", "pessimism"):
             keep_checked(self, name, check_scalar, 0.0, 1.0)
         keep_checked(self, "noise", check_scalar, 0.0)
-        if not isinstance(self.discount, Array) and self.discount == 1.0:
-            raise ValueError("discount must be below 1, got 1.0.")
+        if not isinstance(self.discount, Tracer) and self.discount == 1.0:
+            raise ValueError(f"discount must be below 1, got {self.discount}.")
 
 
 class Goals(NamedTuple):

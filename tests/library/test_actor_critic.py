@@ -326,6 +326,7 @@ def test_a_gradient_too_large_to_square_is_dropped():
     ("changes", "error", "text"),
     [
         (dict(discount=1.0), ValueError, "discount must be below 1, got 1.0"),
+        (dict(discount=jnp.float32(1)), ValueError, "discount must be below 1, got 1"),
         (dict(trace=1.5), ValueError, r"trace must be in \[0, 1\], got 1.5"),
         (dict(horizon=0), ValueError, "horizon must be at least 1, got 0"),
         (dict(goals=3), TypeError, "goals must be a Goals, got"),
