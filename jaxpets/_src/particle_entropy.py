@@ -93,6 +93,8 @@ def particle_entropy(num_neighbors: int = 12) -> RewardFn:
         count = jnp.minimum(jnp.sum(params.used), num_neighbors)
         found = jnp.arange(num_neighbors) < count
         total = jnp.sum(jnp.where(found, jnp.sqrt(-nearest), 0.0), axis=-1)
-        return jnp.log1p(total / jnp.maximum(count, 1).astype(jnp.float32))
+        entropy = jnp.log1p(total / jnp.maximum(count, 1).astype(jnp.float32))
+        # Of no neighbours the sum would be 0, whatever there is to compare.
+        return jnp.where(jnp.all(jnp.isfinite(next_obs), axis=-1), entropy, jnp.nan)
 
     return reward

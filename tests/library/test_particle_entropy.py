@@ -51,6 +51,7 @@ def test_particle_entropy_equals_the_reference(count):
 def test_before_any_data_no_state_is_worth_more():
     visited = visited_states(dataset_of(some_rows(0), capacity=5), 4)
     np.testing.assert_array_equal(entropy(visited, some_rows(6)), np.zeros(6))
+    assert np.isnan(entropy(visited, np.full((2, D), [[np.nan], [np.inf]]))).all()
 
 
 def test_visited_states_are_spread_over_the_data():
