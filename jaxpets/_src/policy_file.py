@@ -119,7 +119,7 @@ def load_policy(
     file_facts.check_arrays(file, wanted)
     arrays = file.arrays()
     file_facts.check_no_nan(str(file.path), arrays)
-    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    leaves = [jnp.asarray(arrays[name], jnp.float32) for name in wanted]
     structure = cast(Any, jax.tree.structure(template))
     return networks.policy, cast(
         ActorCriticParams, jax.tree.unflatten(structure, leaves)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import toys
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from test_policy_onnx import BOX, SPACES, policy_of
@@ -52,6 +53,16 @@ def test_a_policy_needs_nothing_to_be_said_about_it(saved, tmp_path):
     assert policies.load_policy(path, goals=GOALS)
     with pytest.raises(ValueError, match="its metadata lacks 'about'"):
         models.about(path)
+
+
+def test_a_policy_that_was_rounded_is_one_of_float32(policy, saved, tmp_path):
+    """As a model is, in a file in half the room."""
+    with safe_open(saved, "np") as file:
+        texts = dict(file.metadata())
+    half = {name: x.astype(np.float16) for name, x in load_file(saved).items()}
+    save_file(half, tmp_path / "half", texts)
+    _, found = policies.load_policy(tmp_path / "half", goals=GOALS)
+    toys.assert_trees_close(found, policy[1], rtol=1e-3, atol=1e-6)
 
 
 def test_own_functions_are_not_saved(policy, tmp_path):
