@@ -151,6 +151,8 @@ def of_epochs(
         check_record("state", state, FitState)
         check_like("state", state, jax.eval_shape(init, params))
         check_record("dataset", dataset, Dataset)
+        # Of NumPy, its rows could not be picked by what is traced, outside jit.
+        dataset = jax.tree.map(cast(Any, jnp.asarray), dataset)
         size = dataset.size
         scaler = ensemble.fit_scaler(dataset.data, size)
         data = ensemble.encode(scaler, dataset.data)

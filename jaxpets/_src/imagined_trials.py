@@ -122,7 +122,8 @@ def trial_starts(
         row_key, draw_key = jax.random.split(key)
         chosen = jax.random.randint(row_key, rows, 0, jnp.maximum(dataset.size, 1))
         rewards = draw_all(data, jax.random.split(draw_key, rows))
-        return dataset.data.obs[chosen], rewards
+        # Of NumPy, its rows could not be picked by what is traced, outside jit.
+        return jnp.asarray(dataset.data.obs)[chosen], rewards
 
     return starts
 

@@ -303,6 +303,17 @@ def test_tasks_at_once_are_those_alone():
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
 
 
+def test_states_of_numpy_are_begun_at_outside_jit():
+    """As those of a file: rows are picked by what is traced, which NumPy cannot."""
+    learner = build(num_updates=1)
+    params = PlanParams(WORLD, Task(*map(jnp.float32, TASKS["two"])))
+    key = jax.random.key(0)
+    data = jax.device_get(states(20))
+    state = learner.init(params, key, data)
+    _, metrics = learner.step(params, key, state, data)
+    assert metrics.reward == 2.0 and metrics.num_skipped == 0
+
+
 def test_steps_that_are_not_finite_are_dropped():
     learned = learn("broken state")
     assert learned.metrics.num_skipped == NUM_UPDATES

@@ -168,3 +168,14 @@ def test_a_dataset_of_other_sizes_fails_when_traced(fitter, params, sizes):
         jax.eval_shape(
             fitter.step, params, jax.random.key(0), fitter.init(params), dataset
         )
+
+
+def test_data_of_numpy_are_learned_from_outside_jit(fitter, params, step):
+    """As those of a file: rows are picked by what is traced, which NumPy cannot."""
+    dataset = dataset_of(toys.transitions(9))
+    args = (params, jax.random.key(0), fitter.init(params))
+    want = step(*args, dataset)
+    # Compiled apart, the sums round otherwise.
+    toys.assert_trees_close(
+        fitter.step(*args, jax.device_get(dataset)), want, rtol=1e-4, atol=1e-6
+    )
