@@ -111,7 +111,9 @@ def build_trials(
         good = said.value > WORST_VALUE / 1e3
         counts = good.astype(jnp.float32)
         value = jnp.where(good, said.value, 0.0)
-        state = keep(state, Plans(seen, wanted, value, counts))
+        # Where the state is not finite, no weight of 0 would mask what was seen.
+        known = jnp.where(good[..., None], seen, 0.0)
+        state = keep(state, Plans(known, wanted, value, counts))
         again = jax.random.uniform(again_key, rows, jnp.float32) < config.restart
         again |= ~(steps.counts[0] & steps.goes_on[0])
         obs, rewards, planning = renewed(
@@ -120,7 +122,7 @@ def build_trials(
             (steps.next_obs[0], state.rewards, planning),
         )
         state = state._replace(obs=obs, rewards=rewards, planning=planning)
-        square = counts * jnp.mean((own - wanted) ** 2, -1)
+        square = jnp.where(good, jnp.mean((own - wanted) ** 2, -1), 0.0)
         return state, Asked(jnp.sum(square), jnp.sum(value), jnp.sum(counts))
 
     return Trials(fresh, plan, ask)

@@ -174,6 +174,18 @@ def test_a_search_without_a_finite_plan_teaches_nothing():
     assert all(jax.tree.leaves(same))
 
 
+def test_a_state_that_is_not_finite_costs_no_step():
+    """It was kept with a weight of 0, of which NaN is not masked."""
+    data = states()
+    obs = data.data.obs.at[::2].set(jnp.nan)
+    data = data._replace(data=data.data._replace(obs=obs))
+    distiller, known = build(restart=1.0, num_updates=3), PlanParams(GAIN, TARGETS)
+    before = jax.jit(distiller.init)(known, jax.random.key(0), data)
+    after, metrics = jax.jit(distiller.step)(known, jax.random.key(1), before, data)
+    assert metrics.num_skipped == 0 and jnp.isfinite(metrics.error)
+    assert 0 < float(after.plans.counts.sum()) < int(after.size)
+
+
 def test_trials_end_where_they_are_said_to_end():
     _, after, _ = one_call(
         terminal_fn=lambda target, obs: jnp.abs(obs[..., 0]) > 0.5, restart=0.0
