@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_key, check_record
-from jaxpets._src.moments import moments
+from jaxpets._src.moments import counted, moments
 from jaxpets._src.optimizer import Optimizer, check_optimizer
 from jaxpets._src.types import Dataset, RewardFn
 
@@ -116,8 +116,7 @@ def random_network_distillation(
         check_record("dataset", dataset, Dataset)
         rows = dataset.data.next_obs
         check_array("dataset.data.next_obs", rows, ["C", obs_size])
-        used = jnp.arange(rows.shape[0]) < dataset.size
-        used &= jnp.all(jnp.isfinite(rows), axis=1)
+        used = counted(rows, dataset.size)
         mean, std = moments(rows, dataset.size)
         state = state._replace(mean=mean, std=std)
         inputs = jnp.where(used[:, None], _whiten(state, rows), 0.0)

@@ -7,13 +7,17 @@ from jax import Array
 _MIN_STD = 1e-6
 
 
+def counted(rows: Array, size: Array) -> Array:
+    """Returns which rows of `[C, F]` count, `[C]`: the first `size`, if finite."""
+    return (jnp.arange(rows.shape[0]) < size) & jnp.all(jnp.isfinite(rows), axis=1)
+
+
 def moments(rows: Array, size: Array) -> tuple[Array, Array]:
     """Returns mean and std `[F]` of the first `size` rows of `[C, F]`; no std is 0.
 
     A row that is not finite does not count.
     """
-    used = (jnp.arange(rows.shape[0]) < size) & jnp.all(jnp.isfinite(rows), axis=1)
-    used = used[:, None]
+    used = counted(rows, size)[:, None]
     count = jnp.maximum(jnp.sum(used), 1).astype(jnp.float32)
     # From the first row, where the mean of a constant column is exact.
     first = jnp.where(used[0], rows[0], 0.0)

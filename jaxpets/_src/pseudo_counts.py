@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_key, check_record
-from jaxpets._src.moments import moments
+from jaxpets._src.moments import counted, moments
 from jaxpets._src.types import Dataset
 
 # A code is one uint32. Sorting codes and searching them counts exactly for every k up
@@ -66,7 +66,8 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
       PseudoCounts for `pseudo_count`; no state that is not finite is counted.
 
     Raises:
-      ValueError: if the projection does not fit the observations or has over 32 rows.
+      TypeError, ValueError: unless dataset is one, or if the projection does not fit
+        its observations or has over 32 rows.
     """
     check_record("dataset", dataset, Dataset)
     obs = dataset.data.next_obs
@@ -77,9 +78,7 @@ def count_states(projection: Array, dataset: Dataset) -> PseudoCounts:
             f"projection must have at most {_MAX_BITS} rows, got {projection.shape[0]}."
         )
     mean, std = moments(obs, dataset.size)
-    used = (jnp.arange(obs.shape[0]) < dataset.size) & jnp.all(
-        jnp.isfinite(obs), axis=1
-    )
+    used = counted(obs, dataset.size)
     num_used = jnp.sum(used, dtype=jnp.int32)
     codes = _hash(projection, mean, std, obs)
     # Padding sorts behind or among equal real codes, and is cut off when counting.
