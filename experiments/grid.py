@@ -47,13 +47,36 @@ class Job(NamedTuple):
 def read(path: Path) -> Sweep:
     """Returns what a file says.
 
+    A file with a `base`, another one's path from its folder, says what differs from it:
+    entries of the grid and flags one by one, everything else as a whole.
+
     Raises:
       UsageError: naming the file, and what in it is not valid.
     """
+    said = _load(path)
+    if (base := said.pop("base", None)) is not None:
+        below = path.parent / str(base)
+        under = msgspec.to_builtins(
+            _sweep(below, _load(below))
+        )  # it has no base itself
+        own = _sweep(path, {"out": "", "grid": {}} | said)
+        flags = _flat(under["flags"]) | _flat(own.flags)
+        said = under | said | {"grid": under["grid"] | own.grid, "flags": flags}
+    return _sweep(path, said)
+
+
+def _load(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
-            return msgspec.convert(tomllib.load(file), Sweep)
-    except (OSError, ValueError) as error:  # msgspec's and tomllib's are ValueErrors
+            return tomllib.load(file)
+    except (OSError, ValueError) as error:  # tomllib's is a ValueError
+        raise UsageError(f"{path} is no sweep: {error}") from error
+
+
+def _sweep(path: Path, said: Mapping[str, Any]) -> Sweep:
+    try:
+        return msgspec.convert(said, Sweep)
+    except msgspec.ValidationError as error:
         raise UsageError(f"{path} is no sweep: {error}") from error
 
 

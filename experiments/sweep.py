@@ -60,6 +60,9 @@ A sweep is a file like this:
   slurm_partition = "gpu"
   timeout_min = 60
 
+With base = "other.toml" a file says what differs from another one: entries of its grid
+and flags one by one, everything else as a whole.
+
 The same command continues a sweep: it leaves out what is complete."""
 _POLL = 0.5  # seconds
 

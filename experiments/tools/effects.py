@@ -46,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog=calling.usage("tools.effects"), description=__doc__
     )
-    parser.add_argument("runs", type=Path, help="a folder with runs below it")
+    words = "a folder with runs below it; arms of a second one are named after it"
+    parser.add_argument("runs", type=Path, nargs="+", help=words)
     parser.add_argument("--ceilings", type=Path, required=True, help="the simulator's")
     parser.add_argument("--explored", type=int, default=60, help="exploration trials")
     parser.add_argument(
@@ -55,7 +56,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the results")
     args = parser.parse_args(argv)
     try:
-        rows = [row for row in logs.load(args.runs) if row.explored == args.explored]
+        rows = logs.load(args.runs[0])
+        for folder in args.runs[1:]:
+            rows += [
+                x._replace(arm=f"{x.arm}, {folder.name}") for x in logs.load(folder)
+            ]
+        rows = [row for row in rows if row.explored == args.explored]
         found = results(rows, ceilings(args.ceilings))
         if args.json is not None:
             with storage_errors(f"write {args.json}"):

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from .. import calling, robots, signals
@@ -21,7 +20,7 @@ from ..config import Config
 from ..errors import RunError, UsageError, last_line, storage_errors
 from ..report import logs, stats, tables
 from ..storage import rundir
-from . import suite_figure
+from . import peers, suite_figure
 
 # Of Plan2Explore's ten domains. A finger that spins has another damping: two robots.
 TASKS = {
@@ -51,26 +50,7 @@ _HALVES = {
     "domains that settings were chosen on": _CHOSEN,
     "the other domains": tuple(x for x in NAMES if x not in _CHOSEN),
 }
-ENDS = (0, -1)  # of others' steps: the fewest and the most
-PEERS = Path("results/dmc20-peers.json")
 Results = dict[str, dict[str, dict[str, Any]]]  # arm -> domain/task -> numbers
-
-
-class System(msgspec.Struct, frozen=True):
-    """Somebody else's numbers: after so many steps, with the reward or without."""
-
-    name: str
-    reward: bool
-    steps: list[int]
-    source: str
-    about: str
-
-
-class Peers(msgspec.Struct, frozen=True):
-    """Returns by system and task, one for each of the system's steps."""
-
-    systems: list[System]
-    returns: dict[str, dict[str, list[float]]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,22 +58,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog=calling.usage("tools.suite"), description=__doc__
     )
-    words = "a folder with runs below it, or a file of their results"
-    parser.add_argument("runs", type=Path, help=words)
-    parser.add_argument("--explored", type=int, default=100, help="exploration trials")
+    words = "a folder with runs below it, or a file of results; "
+    words += "arms of a second one are named after it"
+    parser.add_argument("runs", type=Path, nargs="+", help=words)
+    words = "exploration trials; by default the most"
+    parser.add_argument("--explored", type=int, help=words)
     parser.add_argument("--tag", default="", help="the variant of phase 2")
-    parser.add_argument("--peers", type=Path, default=PEERS, help="others' numbers")
+    parser.add_argument(
+        "--peers", type=Path, default=peers.FILE, help="others' numbers"
+    )
     parser.add_argument("--json", type=Path, help="file for the results")
     parser.add_argument("--figure", type=Path, help="file for them as a figure")
     words = "also by how much the others return more than this one"
     parser.add_argument("--than", metavar="ARM", help=words)
     args = parser.parse_args(argv)
     try:
-        if args.runs.is_file():
-            found = read(args.runs)
-        else:
-            found = results(args.runs, args.explored, args.tag)
-        peers = read_peers(args.peers)
+        found: Results = {}
+        variant = args.explored, args.tag
+        for i, path in enumerate(args.runs):
+            own = read(path) if path.is_file() else results(path, *variant)
+            found |= {f"{arm}, {path.stem}" if i else arm: x for arm, x in own.items()}
+        others = peers.read(args.peers)
         if args.than is not None and args.than not in found:
             raise UsageError(f"--than {args.than}: it is none of {', '.join(found)}.")
         if args.json is not None:
@@ -101,35 +86,35 @@ def main(argv: Sequence[str] | None = None) -> int:
                 rundir.write_json(args.json, found)
         if args.figure is not None:
             with storage_errors(f"write {args.figure}"):
-                suite_figure.draw(
-                    args.figure, found, peers.returns, _labels(peers), _HALVES
-                )
+                labels = peers.labels(others)
+                suite_figure.draw(args.figure, found, others.returns, labels, _HALVES)
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
     if args.than is None:
-        lines = table(found, peers)
+        lines = table(found, others)
     else:
-        arms = {
-            x: own for x, own in found.items() if own.keys() >= found[args.than].keys()
-        }
-        lines = [*table(arms, peers), "", *differences(arms, args.than)]
+        has = found[args.than].keys()
+        arms = {x: own for x, own in found.items() if own.keys() >= has}
+        lines = [*table(arms, others), "", *differences(arms, args.than)]
     print("\n".join(lines))
     return 0
 
 
-def results(runs: Path, explored: int, tag: str) -> Results:
+def results(runs: Path, explored: int | None, tag: str) -> Results:
     """Returns the mean, the interval and each seed's mean, by arm and task.
 
     Args:
       runs: a folder with runs below it.
-      explored: for models that explored so many trials.
+      explored: for models that explored so many trials; None: the most of all.
       tag: of the variant of phase 2; empty for the one without.
 
     Raises:
       RunError: if a log cannot be read, or there is none.
     """
     rows = [row for row in logs.load(runs) if row.tag == tag]
+    if explored is None:
+        explored = max((x.explored for x in rows if x.phase == "zero-shot"), default=0)
     configs = {run: logs.config(run) for run in {row.run for row in rows}}
     found: Results = {}
     for domain, tasks in TASKS.items():
@@ -144,13 +129,13 @@ def results(runs: Path, explored: int, tag: str) -> Results:
     return found
 
 
-def table(found: Results, peers: Peers) -> list[str]:
+def table(found: Results, others: peers.Peers) -> list[str]:
     """Returns the tasks as rows: our arms, then others after fewest and most steps."""
     arms = tables.in_order(found)
-    columns = [(x, i) for x in peers.systems for i in ENDS]
+    columns = [(x, i) for x in others.systems for i in peers.ENDS]
     lines = [
         [name, *(cell(found[arm].get(name)) for arm in arms)]
-        + [f"{peers.returns[x.name][name][i]:.0f}" for x, i in columns]
+        + [f"{others.returns[x.name][name][i]:.0f}" for x, i in columns]
         for name in NAMES
     ]
     groups = {"**mean**": NAMES, **_HALVES}
@@ -158,17 +143,21 @@ def table(found: Results, peers: Peers) -> list[str]:
         groups[f"the {len(common)} tasks that every arm has"] = common
     for group, names in groups.items():
         theirs = [
-            f"{statistics.mean(peers.returns[x.name][name][i] for name in names):.0f}"
+            f"{statistics.mean(others.returns[x.name][name][i] for name in names):.0f}"
             for x, i in columns
         ]
         lines.append([group, *(_mean(found[arm], names) for arm in arms), *theirs])
+    said = ("without", "with")
     about = [
-        f"- {x.name} ({'with' if x.reward else 'without'} the reward): {x.source}. "
-        f"{x.about}"
-        for x in peers.systems
+        f"- {x.name} ({said[x.reward]} the reward): {x.source}. {x.about}"
+        for x in others.systems
     ]
-    said = [_label(x, i) for x, i in columns]
-    return [*tables.table(["task", *(f"`{x}`" for x in arms), *said], lines), *about]
+    header = [
+        "task",
+        *(f"`{x}`" for x in arms),
+        *(peers.label(x, i) for x, i in columns),
+    ]
+    return [*tables.table(header, lines), *about]
 
 
 def differences(found: Results, than: str) -> list[str]:
@@ -194,42 +183,13 @@ def _common(found: Results) -> tuple[str, ...]:
     return tuple(x for x in NAMES if all(x in own for own in found.values()))
 
 
-def _labels(peers: Peers) -> dict[tuple[str, int], str]:
-    """Returns what a figure says of a system after its fewest and its most steps."""
-    return {
-        (x.name, i): _label(x, i) + ", with the reward" * x.reward
-        for x in peers.systems
-        for i in ENDS
-    }
-
-
-def _label(system: System, i: int) -> str:
-    return f"{system.name}, {system.steps[i] / 1e6:g}M"
-
-
 def read(path: Path) -> Results:
     """Reads a file of results.
 
     Raises:
       RunError: if it is not there, or is not one.
     """
-    return _read(path, Results, "results")
-
-
-def read_peers(path: Path) -> Peers:
-    """Reads a file of others' numbers.
-
-    Raises:
-      RunError: if it is not there, or is not one.
-    """
-    return _read(path, Peers, "numbers of others")
-
-
-def _read(path: Path, form: Any, what: str) -> Any:
-    try:
-        return msgspec.convert(rundir.read_json(path), form)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{path} has no {what}: {error}") from error
+    return peers.read_as(path, Results, "results")
 
 
 def _trial_steps(config: Mapping[str, Any]) -> int:
@@ -289,7 +249,7 @@ def _less(
 
 
 def _of_seeds(own: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """Returns each finite seed's mean of tasks, `[S]`; of none if tasks have others."""
+    """Returns each finite seed's mean of tasks, `[S]`; none if tasks have others."""
     seeds = {frozenset(y for y, z in x["seeds"].items() if z is not None) for x in own}
     same = sorted(seeds.pop()) if len(seeds) == 1 else []
     return np.array([statistics.mean(x["seeds"][y] for x in own) for y in same], float)

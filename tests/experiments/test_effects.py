@@ -92,6 +92,14 @@ def test_arms_are_compared_with_one_of_them(runs, ceilings, capsys):
     assert "| `best` | - | 30.0 [-30.8, 90.8] | - |" in less
 
 
+def test_arms_of_a_second_folder_are_named_after_it(runs, ceilings, tmp_path, capsys):
+    performed(tmp_path / "more", "best", "icem", {"forward": [50], "jump": [20]})
+    flags = [str(tmp_path / "more"), "--ceilings", str(ceilings)]
+    assert effects.main([str(runs), *flags]) == 0
+    papers = sections(capsys.readouterr().out)["the paper's tasks"]
+    assert "| `best, more` | - | 0.50 [0.50, 0.50] | - |" in papers
+
+
 def test_variants_are_compared_where_one_thing_differs(runs, ceilings, capsys):
     assert effects.main([str(runs), "--ceilings", str(ceilings)]) == 0
     pairs = sections(capsys.readouterr().out)["one variant less another, %"]

@@ -8,9 +8,10 @@ import pytest
 from small_logs import write_run
 
 from experiments.storage import rundir
+from experiments.tools import peers as published
 from experiments.tools import suite
 
-PEERS_FILE = Path(__file__).parents[2] / suite.PEERS
+PEERS_FILE = Path(__file__).parents[2] / published.FILE
 OTHERS = ("opax", "plan2explore", "jensen-renyi")  # objectives that are not ours
 PEERS = {
     "systems": [
@@ -142,6 +143,22 @@ def test_a_variant_is_asked_for(runs, tmp_path, peers, capsys):
     assert "| finger/spin | 0 [0, 0] | 10 | 31 |" in capsys.readouterr().out
 
 
+def test_arms_of_more_folders_are_named_after_them(runs, tmp_path, peers, capsys):
+    """Of each folder what explored most, unless it is said how many trials."""
+    more, path = tmp_path / "more", tmp_path / "suite.json"
+    performed(more / "early", "dmc/cheetah", {"run": [1, 1]}, explored=2)
+    performed(more / "late", "dmc/cheetah", {"run": [900, 900]}, explored=8)
+    flags = ["--peers", peers, "--json", str(path)]
+    assert suite.main([str(runs), str(more), *flags, "--than", "best, more"]) == 0
+    text = capsys.readouterr().out
+    assert "| task | `best` | `best, more` | Rival, 0.1M | Rival, 1M |" in text
+    assert "| cheetah/run | 900 [900, 900] | -300 [-1571, 971] |" in text
+    found = json.loads(path.read_text())
+    assert found["best, more"]["cheetah/run"]["steps"] == 8000
+    assert suite.main([str(path), str(more), "--explored", "2", "--peers", peers]) == 0
+    assert "| cheetah/run | 600 [-671, 1871] | 1 [1, 1] |" in capsys.readouterr().out
+
+
 def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
     assert suite.main([str(tmp_path / "none"), "--peers", peers]) == 2
     assert "there is no metrics.jsonl" in capsys.readouterr().err
@@ -152,7 +169,7 @@ def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
 
 
 def test_the_committed_numbers_of_others_are_of_every_task():
-    peers = suite.read_peers(PEERS_FILE)
+    peers = published.read(PEERS_FILE)
     assert {x.name for x in peers.systems} == set(peers.returns)
     for system in peers.systems:
         returns = peers.returns[system.name]

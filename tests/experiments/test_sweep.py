@@ -125,7 +125,59 @@ def test_a_tag_of_any_value_is_one_that_the_phase_takes(file, tmp_path, monkeypa
     assert tags == wanted
 
 
-@pytest.mark.parametrize("name", ["dmc20", "study", "search"])
+BASED = """
+base = "sweep.toml"
+[grid]
+arm = ["best"]
+seeds = [3]
+[flags]
+num-trials = 2
+planner.horizon = 5
+"""
+
+
+def test_a_file_says_what_differs_from_its_base(file, tmp_path):
+    """Entries of the grid and flags one by one, and what it does not say is there."""
+    file(FILE + THEN)
+    path = tmp_path / "based.toml"
+    path.write_text(BASED)
+    (job,) = grid.jobs(grid.read(path))
+    explore, perform = (" ".join(command) for command in job.commands)
+    assert f"--out {tmp_path / 'runs'} --name best-3 " in explore
+    assert "--preset smoke --engine mujoco --num-trials 2" in explore
+    assert "--planner.num-particles 2" in explore and "--planner.horizon 5" in explore
+    assert "--trial-length" not in explore  # which is of random alone
+    assert perform.startswith("zero-shot") and perform.endswith("--task forward")
+    path.write_text('out = "other"\nthen = []' + BASED)
+    (job,) = grid.jobs(grid.read(path))
+    assert len(job.commands) == 1 and "--out other" in " ".join(job.commands[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('base = "none.toml"', "none.toml is no sweep"),
+        ('base = "sweep.toml"\nflags = 3', "based.toml is no sweep"),
+        ('base = "sweep.toml"\nx = 3', "unknown field `x`"),
+        ('base = "based.toml"', "unknown field `base`"),  # not of itself, nor a chain
+        ("base = 3", "3 is no sweep"),
+    ],
+)
+def test_a_base_that_cannot_be_one_is_refused(file, tmp_path, capsys, text, words):
+    file(FILE)
+    path = tmp_path / "based.toml"
+    path.write_text(text)
+    assert sweep.main([str(path)]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dmc20", "dmc20-50k", "dmc20-200k", "study", "study-margin", "study-models",
+        "search",
+    ],
+)  # fmt: skip
 def test_the_files_of_tables_are_valid(name, monkeypatch):
     """Flags and tags, of every run and phase; --list would read the robots as well."""
     monkeypatch.chdir(Path(sweep.__file__).parents[1])  # where their commands are given
