@@ -144,7 +144,7 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
     root = Path(__file__).parents[2]
     study = root / "results" / "study"
     for path in study.glob("*.tar.xz"):
-        if path.name != "stopped.tar.xz":
+        if path.name not in ("stopped.tar.xz", "margin.tar.xz"):
             with tarfile.open(path) as logs:
                 logs.extractall(tmp_path, filter="data")
     found = tmp_path / "found.json"
@@ -171,6 +171,29 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
         at = variants.index(variant)
         cells = [held_out[f"`{arm}`"][at] for arm in _ON_THE_FRONT]
         assert f"| {words} | {' | '.join(cells)} |" in front
+
+
+def test_the_page_has_what_the_margin_brings(tmp_path, capsys):
+    study = Path(__file__).parents[2] / "results" / "study"
+    runs, margin = tmp_path / "runs", tmp_path / "study-margin"
+    for name, folder in (("best", runs), ("margin", tmp_path)):
+        with tarfile.open(study / f"{name}.tar.xz") as logs:
+            logs.extractall(folder, filter="data")
+    flags = ["--ceilings", str(study / "simulator.jsonl")]
+    assert effects.main([str(runs), str(margin), *flags]) == 0
+    shown = sections(capsys.readouterr().out)
+    variants = shown["other tasks, less `best`, %"][0].strip("| ").split(" | ")
+    at = variants.index("refit-icem")
+    held_out, papers = (
+        shown[f"{group}, less `best`, %"][-1].strip("| ").split(" | ")
+        for group in ("other tasks", "the paper's tasks")
+    )
+    assert held_out[0] == "`best, study-margin`" and held_out[at] == "-0.2 [-3.2, 2.8]"
+    assert papers[at] == "1.1 [-4.1, 6.3]"
+    means = [float(x.split()[0]) for x in (*held_out[1:], *papers[1:])]
+    assert max(map(abs, means)) == 1.5
+    page = (study.parent / "study.md").read_text()
+    assert "`best` scores 0.2 [-2.8, 3.2] less on held-out tasks" in page
 
 
 _IN_THE_JSON = (

@@ -198,6 +198,30 @@ def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
             assert " | ".join([*own, *others[:3]]) in front
 
 
+def test_committed_steps_are_those_of_the_committed_logs(tmp_path, capsys):
+    results = Path(__file__).parents[2] / "results"
+    with tarfile.open(results / "dmc20" / "steps.tar.xz") as logs:
+        logs.extractall(tmp_path, filter="data")
+    path = results / "dmc20" / "steps.json"
+    found = {"best": json.loads((results / "dmc20.json").read_text())["best"]}
+    for name in ("dmc20-50k", "dmc20-200k"):
+        found[f"best, {name}"] = suite.results(tmp_path / name, None, "")["best"]
+    assert found == json.loads(path.read_text())
+    flags = ["--peers", str(PEERS_FILE), "--than", "best, dmc20-50k"]
+    assert suite.main([str(path), *flags]) == 0
+    table, compared = capsys.readouterr().out.split("| task | `best, dmc20-50k` |")
+    page = " ".join((results / "dmc20.md").read_text().split())
+    for line in table.splitlines()[2:25]:
+        task, best, early, *_ = _cells(line)
+        late = found["best, dmc20-200k"].get(task)
+        late = "" if late is None else suite.cell(late)
+        assert f"| {task} | {early} | {best} | {late} |".replace("  |", " |") in page
+    gains = {_cells(x)[0]: _cells(x)[-1] for x in compared.splitlines() if x}
+    assert f"**Half of the steps lose {gains['**mean** (of 20)']}.**" in page
+    for task in ("quadruped/walk", "quadruped/run", "cheetah/run", "walker/run"):
+        assert f"`{task}` by {gains[task]}" in page
+
+
 @pytest.mark.parametrize("arm", OTHERS)
 def test_the_page_compares_another_objective_with_ours(arm, capsys):
     results = Path(__file__).parents[2] / "results"
