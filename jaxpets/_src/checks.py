@@ -112,9 +112,14 @@ def check_record(name: str, value: Any, record: type) -> None:
 
 def check_callable(name: str, value: Any) -> None:
     """Raises unless `value` can be called."""
-    if not callable(value):
-        kind = type(value).__name__
-        raise TypeError(f"{name} must be a function, got {value!r} ({kind}).")
+    if callable(value):
+        return
+    kind = type(value).__name__
+    if hasattr(value, "_fields"):  # of an Ensemble, say: its functions fill a page
+        own = ", ".join(x for x in value._fields if callable(getattr(value, x)))
+        has = f", whose functions are {own}" if own else ""
+        raise TypeError(f"{name} must be a function, got {kind}{has}.")
+    raise TypeError(f"{name} must be a function, got {value!r} ({kind}).")
 
 
 def check_functions(name: str, value: Any, kind: type) -> None:

@@ -232,3 +232,15 @@ def test_key_refuses_a_batch():
 def test_reals_take_a_sequence(values):
     with pytest.raises(TypeError, match=r"rates must be a tuple of floats, got"):
         checks.check_reals("rates", values, 0.0)
+
+
+def test_a_record_in_place_of_a_function_is_named_with_its_functions():
+    """And not printed, which would be a page of them."""
+    model = jaxpets.ensemble(
+        jaxpets.EnsembleConfig(), jaxpets.delta_space(), obs_size=4, action_size=2
+    )
+    words = "dynamics_fn must be a function, got Ensemble, whose functions are init, "
+    with pytest.raises(TypeError, match=words + r".* sample, .*sentinels\.$"):
+        jaxpets.particle_rollout(model)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"a function, got PlanParams\.$"):
+        checks.check_callable("dynamics_fn", jaxpets.PlanParams((), ()))
