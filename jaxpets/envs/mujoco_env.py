@@ -84,9 +84,9 @@ def mujoco_env(
 
     Raises:
       TypeError, ValueError: naming what cannot be: a model that does not compile or has
-        no actuator or one without a range, a name that is no entry, a time that is no
-        multiple, a function or a number of threads that is none, or what the backend
-        lacks.
+        no actuator or one without a finite range, a name that is no entry, a time that
+        is no multiple, a function or a number of threads that is none, or what the
+        backend lacks.
       FileNotFoundError: if there is no such file.
     """
     for name, function in (("terminal_fn", terminal_fn), ("constants", constants)):
@@ -167,13 +167,20 @@ def _action_range(model: Any) -> tuple[Array, Array]:
     """Returns the least and greatest control of every actuator, `[A]` both."""
     if not model.nu:
         raise ValueError("model must have an actuator, got none.")
-    for actuator in range(model.nu):
+    with np.errstate(over="ignore"):  # what is too large is refused below
+        limits = np.asarray(model.actuator_ctrlrange, np.float32)
+    for actuator, (least, most) in enumerate(limits):
+        name = model.actuator(actuator).name or f"actuator{actuator}"
         if not model.actuator_ctrllimited[actuator]:
-            name = model.actuator(actuator).name or f"actuator{actuator}"
             raise ValueError(
                 f"every actuator must have a ctrlrange, but {name} has none."
             )
-    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+        if not -np.inf < least < most < np.inf:
+            raise ValueError(
+                "every ctrlrange must go from a finite number to a greater one, but "
+                f"that of {name} is {least:g} to {most:g}."
+            )
+    low, high = jnp.asarray(limits).T
     return low, high
 
 

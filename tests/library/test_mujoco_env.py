@@ -234,6 +234,12 @@ BAD = {
     "every actuator must have a ctrlrange, but actuator0 has none": (
         NO_RANGE.replace('name="push"', ""), {},
     ),
+    "every ctrlrange must go from a finite .* but that of push is -inf to inf": (
+        CART.replace('"-1 1"', '"-inf inf"'), {},
+    ),
+    "every ctrlrange must go from a finite .* but that of actuator0 is 0 to inf": (
+        CART.replace('name="push"', "").replace('"-1 1"', '"0 1e39"'), {},
+    ),
     "model must have an actuator, got none": (
         robots.mjcf('<body><joint/><geom size="1"/></body>'), {},
     ),
