@@ -63,7 +63,8 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
       observe: names.
 
     Raises:
-      TypeError, ValueError: if a name is none of the model; the nearest are said.
+      TypeError, ValueError: if a name is none of the model; the nearest are said. Or if
+        it is of a clock, as a state has no time.
     """
     if not is_sequence(observe):
         raise TypeError(f"observe must be a sequence of names, got {observe!r}.")
@@ -79,7 +80,22 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
         found += chosen
     if not found:
         raise ValueError(f"observe must name an entry of the model, got {observe!r}.")
+    for reading in found:
+        if reading.source == "sensordata" and reading.place in _clocks(model):
+            name = reading.coordinate.name
+            raise ValueError(
+                f"observe must be of a state, which has no time, but {name} is a clock."
+            )
     return tuple(found)
+
+
+def _clocks(model: Any) -> list[int]:
+    """Returns where sensors that read the time are in sensordata.
+
+    Physics is stepped from its positions and velocities, so they would stand still.
+    """
+    kind = int(_C.mjtSensor.mjSENS_CLOCK)
+    return [int(place) for place in model.sensor_adr[model.sensor_type == kind]]
 
 
 def _chosen(groups: dict[str, list[Reading]], name: str) -> list[Reading]:

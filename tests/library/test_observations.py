@@ -149,6 +149,17 @@ def test_nothing_to_observe_is_refused():
         readings(FREE, [])
 
 
+def test_a_clock_is_not_read():
+    """Steps keep no time, so that it would say the same in every state."""
+    sensors = '<sensor><jointpos joint="hip"/><clock name="now"/></sensor>'
+    model = robots.compiled(robots.FREE, sensors)
+    for observe in ("sensordata/now", "sensordata"):
+        with pytest.raises(ValueError, match="no time, but sensordata/now is a cl"):
+            readings(model, ["qpos", observe])
+    (bend,) = readings(model, ["sensordata/sensor0"])
+    assert bend.place == 0
+
+
 # -- symmetry ------------------------------------------------------------------------
 
 SHAPE = '<geom size="0.1"/>'
