@@ -118,6 +118,9 @@ def last_obs(
     reached = numbers(world, "next_obs", next_obs)
     if world.autoreset != "SameStep" or not done.any():
         return reached
+    if not isinstance(info, (Mapping, type(None))):  # pyright: ignore[reportUnnecessaryIsInstance]
+        kind = type(info).__name__
+        raise TypeError(f"info must be a dict that has final_obs, got {kind}.")
     found = (info or {}).get("final_obs")
     if found is None:
         raise ValueError(

@@ -314,6 +314,10 @@ def test_what_a_world_may_not_say(make, trained):
     ended = np.array([True, False])
     with pytest.raises(ValueError, match="info must have final_obs"):
         two.observe(np.zeros((2, 2)), ended)
+    with pytest.raises(
+        TypeError, match="info must be a dict that has final_obs, got list"
+    ):
+        two.observe(np.zeros((2, 2)), ended, info=[{"final_obs": at(0)}, {}])
     with pytest.raises(ValueError, match="must have 2 rows, got 1"):
         two.observe(np.zeros((2, 2)), ended, info={"final_obs": [at(0)]})
 
