@@ -215,6 +215,16 @@ def test_a_start_may_be_of_numpy(key):
     np.testing.assert_allclose(physics.qpos[3:7], [0.5] * 4)
 
 
+def test_a_start_of_zeros_turns_nothing(key):
+    def own(key):
+        del key
+        return jnp.zeros(12), jnp.zeros(10)
+
+    physics = mujoco_env(robots.FREE_XML, reset=own).reset(key).physics
+    want = [0.0] * 3 + [1.0, 0.0, 0.0, 0.0] + [0.0] + [1.0, 0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(physics.qpos, want)
+
+
 def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     path = tmp_path / "cart.xml"
     path.write_text(CART)
