@@ -56,22 +56,33 @@ def native_engine(
         model, num_substeps=num_substeps, num_threads=num_threads
     )
     read_fn = native_readings(model, places, num_threads=num_threads)
-    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    clip = _clip_fn(model)
 
     def advance(before: Physics, action: Array) -> Physics:
-        # MuJoCo clips as well, but takes an infinite control for 0.
-        return Physics(*physics_fn(*before, jnp.clip(action, low, high)))
+        return Physics(*physics_fn(*before, clip(action)))
 
     def read(physics: Physics, action: Array) -> Array:
-        return read_fn(*physics, jnp.clip(action, low, high))
+        return read_fn(*physics, clip(action))
 
     return Engine(advance, read)
+
+
+def _clip_fn(model: Any) -> Callable[[Array], Array]:
+    """Returns what brings an action into the range of the actuators.
+
+    MuJoCo clips as well, unless a model's flag says that it must not; and C MuJoCo
+    takes an infinite control for 0.
+    """
+    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    return lambda action: jnp.clip(action, low, high)
 
 
 def mjx_engine(
     model: Any, *, num_substeps: int, places: Sequence[tuple[str, int]] = ()
 ) -> Engine:
     """Builds physics in MJX, with the settings of the model's solver.
+
+    Actions are clipped as `native_engine` does.
 
     Raises:
       ValueError: if the model uses what MJX does not have.
@@ -88,13 +99,14 @@ def mjx_engine(
     mjx_step = cast(Callable[[Any, Any], Any], mjx.step)
     mjx_forward = cast(Callable[[Any, Any], Any], mjx.forward)
     subtree_vel = cast(Callable[[Any, Any], Any], mjx.subtree_vel)
+    clip = _clip_fn(model)
 
     def data_of(physics: Physics, action: Array) -> Any:
         data = template.replace(
             qpos=physics.qpos,
             qvel=physics.qvel,
             qacc_warmstart=physics.qacc_warmstart,
-            ctrl=action,
+            ctrl=clip(action),
         )
         return data.replace(act=physics.act) if model.na else data
 

@@ -108,6 +108,17 @@ def test_one_step_on_mjx_is_that_of_c(key):
     np.testing.assert_allclose(got.physics.act, want.physics.act, rtol=1e-6)
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+def test_an_action_stays_in_its_range_whatever_a_flag_says(backend, key):
+    flag = '<mujoco><option><flag clampctrl="disable"/></option>'
+    env = mujoco_env(
+        CART.replace("<mujoco>", flag), control_step=0.002, backend=backend
+    )
+    start, step = env.reset(key), jax.jit(env.step)
+    far, most = (step(start, jnp.full((1,), x)).obs for x in (3.0, 1.0))
+    np.testing.assert_array_equal(far, most)
+
+
 def test_activations_are_state_and_are_observed(key):
     env = mujoco_env(SLOW_CART, control_step=0.02, observe=("act/push", "qpos"))
     model = mujoco.MjModel.from_xml_string(SLOW_CART)
