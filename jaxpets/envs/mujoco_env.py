@@ -1,5 +1,6 @@
 """Any robot: an environment from an MJCF, its entries named and its space derived."""
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -149,9 +150,10 @@ def load_model(model: Any) -> Any:
     if not isinstance(model, (str, Path)):
         kind = type(model).__name__
         raise TypeError(f"model must be a path, MJCF or an MjModel, got {kind}.")
-    is_text = str(model).lstrip().startswith("<")
+    # The text of a file may begin with a byte-order mark, which MuJoCo passes over.
+    is_text = str(model).lstrip("\ufeff \t\r\n").startswith("<")
     where = "this text" if is_text else str(model)
-    if not is_text and not Path(model).is_file():
+    if not is_text and not os.path.isfile(model):  # False as well for what is too long
         raise FileNotFoundError(f"model must be a file or MJCF, but {where} is none.")
     load = _C.MjModel.from_xml_string if is_text else _C.MjModel.from_xml_path
     try:

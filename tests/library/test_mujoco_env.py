@@ -244,12 +244,16 @@ def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     for given in (path, str(path), model):
         jax.tree.map(np.testing.assert_array_equal, mujoco_env(given).reset(key), want)
     assert load_model(model) is model
+    marked = tmp_path / "marked.xml"
+    marked.write_text(CART, encoding="utf-8-sig")
+    assert load_model(marked.read_text(encoding="utf-8")).nq == model.nq
 
 
 NO_RANGE = CART.replace(' ctrlrange="-1 1"', "")
 BAD = {
     "model must be a path, MJCF or an MjModel, got int": (3, {}),
     "model must be a file or MJCF, but none.xml is none": ("none.xml", {}),
+    "model must be a file or MJCF, but a{5000} is none": ("a" * 5000, {}),
     "model must compile, but this text does not: XML": ("<mujoco><x/>", {}),
     "every actuator must have a ctrlrange, but push has none": (NO_RANGE, {}),
     "every actuator must have a ctrlrange, but actuator0 has none": (
