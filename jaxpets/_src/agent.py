@@ -72,7 +72,7 @@ def agent(
         its next step, whatever the action. "SameStep": the world, in the step that ends
         the trial, whose last observation is in `info["final_obs"]`. By default
         "NextStep" where num_envs is given, as Gymnasium has it, and else "Disabled".
-      seed: of all that is drawn.
+      seed: of all that is drawn, below 2**32.
 
     Returns:
       An Agent.
@@ -86,7 +86,7 @@ def agent(
     check_record("random_planner", random_planner, Planner)
     check_functions("reward_data", reward_data, RewardData)
     check_count("capacity", capacity)
-    check_count("seed", seed, minimum=0)
+    check_count("seed", seed, 0, 2**32 - 1)  # JAX cuts off what is above
     if num_envs is not None:
         check_count("num_envs", num_envs)
     if params is not None:

@@ -17,13 +17,17 @@ from jax.core import Tracer
 T = TypeVar("T")
 
 
-def check_count(name: str, value: Any, minimum: int = 1) -> None:
-    """Raises unless `value` is a Python integer of at least `minimum`."""
+def check_count(
+    name: str, value: Any, minimum: int = 1, maximum: float = math.inf
+) -> None:
+    """Raises unless `value` is a Python integer in `[minimum, maximum]`."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python int, got {value!r} ({kind}).")
     if value < minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
+    if value > maximum:
+        raise ValueError(f"{name} must be at most {maximum}, got {value}.")
 
 
 def is_sequence(values: Any) -> TypeGuard[Sequence[Any]]:

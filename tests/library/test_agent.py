@@ -347,6 +347,9 @@ def test_a_world_that_diverges_does_not_stop_the_others(make, trained, mode):
 def test_what_an_agent_may_not_be_made_of(make, parts):
     with pytest.raises(ValueError, match=r"autoreset must be one of .*, got 'never'"):
         make(autoreset="never")
+    for seed in (2**32, 2**70):  # the first would be the seed 0, without a word
+        with pytest.raises(ValueError, match="seed must be at most 4294967295, got"):
+            make(seed=seed)
     with pytest.raises(ValueError, match="num_envs must be at least 1"):
         make(num_envs=0)
     with pytest.raises(ValueError, match="params must"):
