@@ -1,5 +1,6 @@
 """Any robot: an environment from an MJCF, its entries named and its space derived."""
 
+import copy
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -60,7 +61,7 @@ def mujoco_env(
     state that was reached and the action that led there.
 
     Args:
-      model: a path to an MJCF, its text, or a compiled MuJoCo model.
+      model: a path to an MJCF, its text, or a compiled MuJoCo model as it is now.
       observe: what is observed, by the names that `observations.readings` explains; by
         default all joints, but not where the robot stands if nothing depends on it.
       control_step: in s, a multiple of the model's time step.
@@ -96,7 +97,8 @@ def mujoco_env(
     if num_threads is not None:
         check_count("num_threads", num_threads)
     check_real("settle_time", settle_time, 0.0)
-    model = load_model(model)
+    # C MuJoCo reads it at every step, and whoever has it may make another robot of it.
+    model = copy.copy(load_model(model))
     found = readings(model, observe)
     coordinates = space([reading.coordinate for reading in found]).coordinates
     low, high = _action_range(model)

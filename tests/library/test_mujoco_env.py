@@ -249,6 +249,20 @@ def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     assert load_model(marked.read_text(encoding="utf-8")).nq == model.nq
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+def test_what_a_model_becomes_later_is_another_robot(backend, key):
+    model = load_model(CART)
+    env = mujoco_env(model, control_step=0.002, backend=backend)
+    start = env.reset(key)
+    model.body_mass[1:] *= 100.0
+    heavy = mujoco_env(model, control_step=0.002, backend=backend)
+    speed, slower = (
+        abs(x.step(start, jnp.ones(1)).physics.qvel[0] - start.physics.qvel[0])
+        for x in (env, heavy)
+    )
+    assert speed > 10 * slower
+
+
 NO_RANGE = CART.replace(' ctrlrange="-1 1"', "")
 BAD = {
     "model must be a path, MJCF or an MjModel, got int": (3, {}),
