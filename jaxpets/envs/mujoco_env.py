@@ -168,14 +168,15 @@ def load_model(model: Any) -> Any:
 
 
 def _action_range(model: Any) -> tuple[Array, Array]:
-    """Returns the least and greatest control of every actuator, `[A]` both."""
+    """Returns the least and greatest value of every control, `[A]` both."""
     if not model.nu:
         raise ValueError("model must have an actuator, got none.")
     with np.errstate(over="ignore"):  # what is too large is refused below
         limits = np.asarray(model.actuator_ctrlrange, np.float32)
-    for actuator, (least, most) in enumerate(limits):
-        name = model.actuator(actuator).name or f"actuator{actuator}"
-        if not model.actuator_ctrllimited[actuator]:
+    owners = _control_names(model)
+    controls = zip(owners, model.actuator_ctrllimited, limits, strict=True)
+    for name, is_limited, (least, most) in controls:
+        if not is_limited:
             raise ValueError(
                 f"every actuator must have a ctrlrange, but {name} has none."
             )
@@ -186,6 +187,18 @@ def _action_range(model: Any) -> tuple[Array, Array]:
             )
     low, high = jnp.asarray(limits).T
     return low, high
+
+
+def _control_names(model: Any) -> list[str]:
+    """Returns whose each control is: of MuJoCo 4 on one may have several, or none."""
+    count = len(model.actuator_trntype)
+    sizes = getattr(model, "actuator_ctrlnum", np.ones(count, np.int32))
+    found: list[str] = []
+    for i, size in enumerate(sizes):
+        name = model.actuator(i).name or f"actuator{i}"
+        own = [f"control {k} of {name}" for k in range(size)]
+        found += own if size > 1 else [name] * size
+    return found
 
 
 def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:

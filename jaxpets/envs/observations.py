@@ -135,7 +135,7 @@ def _groups(model: Any, shifts: set[int]) -> dict[str, list[Reading]]:
         "mean_qvel": mean,
         "qpos": qpos,
         "qvel": qvel,
-        "act": [r for i in range(model.nu) for r in _activations(model, i)],
+        "act": [r for i in _actuators(model) for r in _activations(model, i)],
         "sensordata": [
             r for i in range(model.nsensor) for r in _sensor(model, i, shifts)
         ],
@@ -193,6 +193,11 @@ def _velocities(model: Any, joint: int) -> list[Reading]:
         Reading("qvel", start + i, Coordinate(f"{name}.{part}" if part else name))
         for i, part in enumerate(parts)
     ]
+
+
+def _actuators(model: Any) -> range:
+    """Returns their numbers; of MuJoCo 4 on, one may have several controls, or none."""
+    return range(len(model.actuator_trntype))
 
 
 def _activations(model: Any, actuator: int) -> list[Reading]:

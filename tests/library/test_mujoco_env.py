@@ -140,6 +140,26 @@ def test_activations_are_state_and_are_observed(key):
     assert hc.half_cheetah_native().reset(key).physics.act == ()
 
 
+@pytest.mark.skipif(
+    mujoco.mj_version() < 4_000_000, reason="an actuator has one control before 4.0"
+)
+def test_an_actuator_may_have_several_controls_or_none(key):
+    """A servo of place and speed, a passive motor, and one with an activation."""
+    servo = '<pid name="servo" joint="hinge" kp="1" kv="1" input="pos vel" {}/>'
+    passive = '<dcmotor joint="hinge" motorconst="1" resistance="1" input="none"/>'
+    added = f"<actuator>{servo}{passive}{passive}"
+    limited = added.format('ctrlrange="-3 3" velrange="-2 2"')
+    env = mujoco_env(SLOW_CART.replace("<actuator>", limited))
+    assert [row.name for row in env.coordinates][-1] == "act/push"
+    np.testing.assert_array_equal(env.action_low, [-3, -2, -1])
+    start = env.reset(key)
+    still, pushed = (env.step(start, jnp.array([0.0, 0.0, x])).obs for x in (0.0, 1.0))
+    assert still[-1] == 0.0 and pushed[-1] > 0.3
+    half = added.format('ctrlrange="-3 3"')
+    with pytest.raises(ValueError, match="but control 1 of servo has none"):
+        mujoco_env(SLOW_CART.replace("<actuator>", half))
+
+
 def test_a_trial_settles_and_has_constants(key):
     def drawn(key):
         return {"target": jax.random.uniform(key, (2,), jnp.float32)}
