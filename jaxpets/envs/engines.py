@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets.envs.extra import needs_extra
-from jaxpets.envs.native import native_physics, native_readings
+from jaxpets.envs.native import check_state, native_physics, native_readings
 
 
 class Physics(NamedTuple):
@@ -85,8 +85,10 @@ def mjx_engine(
     Actions are clipped as `native_engine` does.
 
     Raises:
-      ValueError: if the model uses what MJX does not have.
+      ValueError: if the model uses what MJX does not have, or has a state that Physics
+        does not have.
     """
+    check_state(model)
     # MJX writes to stdout when it finds no warp, which it does not need here.
     with needs_extra(), contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx

@@ -334,6 +334,9 @@ BAD = {
     ),
     'backend must be "mujoco" or "mjx", got \'warp\'': (CART, {"backend": "warp"}),
     "names of coordinates must differ": (CART, {"observe": ["qpos", "qpos"]}),
+    "model must have no state but positions, velocities and activations": (
+        CART.replace("<motor", '<motor delay="0.01" nsample="5"'), {"backend": "mjx"},
+    ),
     "MJX lacks what this model uses": (
         CART.replace("<worldbody>", '<option solver="PGS"/><worldbody>'),
         {"backend": "mjx"},
