@@ -69,8 +69,8 @@ def mujoco_env(
         environment takes as long.
       reset: names of keyframes, of which a trial starts at one at random; or `(key) ->
         (qpos [Q], qvel [V])`, whose quaternions are made unit; or None for the model's
-        own start. All but the function's are within 0.001 of what was named, and have
-        its activations; from the function's they are 0.
+        own start. All but the function's are off what was named by normal noise, of
+        0.001 standard deviation, and have its activations; the function's have none.
       terminal_fn: `(obs [..., D]) -> bool [...]`, whether a trial ends there; None for
         never.
       settle_time: for how long physics goes on from there, with controls of zero, until
