@@ -94,8 +94,9 @@ def mjx_engine(
         from mujoco import mjx
 
     try:
-        device_model = mjx.put_model(model, impl="jax")
-        template = mjx.make_data(model, impl="jax")
+        with _as_mjx_needs():
+            device_model = mjx.put_model(model, impl="jax")
+            template = mjx.make_data(model, impl="jax")
     except NotImplementedError as error:
         raise ValueError(f"MJX lacks what this model uses: {error}.") from error
     mjx_step = cast(Callable[[Any, Any], Any], mjx.step)
@@ -138,9 +139,10 @@ def _as_mjx_needs() -> Generator[None]:
     """Traces MJX in float32, whatever a caller has set.
 
     GPUs multiply in TF32 by default: an error 400 times that of float32. And MJX does
-    not trace under strict promotion.
+    not trace under strict promotion, and under x64 returns other types than it takes.
     """
     with (
+        jax.enable_x64(False),
         jax.default_matmul_precision("highest"),
         jax.numpy_dtype_promotion("standard"),
     ):

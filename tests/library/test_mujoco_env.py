@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import robots
+import toys
 
 import jaxpets
 from jaxpets import coordinates
@@ -106,6 +107,19 @@ def test_one_step_on_mjx_is_that_of_c(key):
     np.testing.assert_allclose(got.obs, want.obs, rtol=1e-4, atol=1e-5)
     assert native.coordinates == mjx.coordinates and want.obs.shape == (9,)
     np.testing.assert_allclose(got.physics.act, want.physics.act, rtol=1e-6)
+
+
+def test_mjx_steps_in_float32_where_a_caller_computes_in_float64(key):
+    def trial():
+        observe = (*DEFAULT, "site_xpos/tip")
+        env = mujoco_env(SLOW_CART, observe=observe, control_step=0.004, backend="mjx")
+        return rolled(env, key, 3)
+
+    with jax.enable_x64(True):
+        got = trial()
+    # The same program but for its counters, compiled twice.
+    toys.assert_trees_close(got, trial(), rtol=1e-5, atol=1e-6)
+    assert {x.dtype for x in jax.tree.leaves(got)} == {np.dtype(np.float32)}
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "mjx"])
