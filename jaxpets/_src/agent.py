@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -72,7 +72,7 @@ def agent(
         its next step, whatever the action. "SameStep": the world, in the step that ends
         the trial, whose last observation is in `info["final_obs"]`. By default
         "NextStep" where num_envs is given, as Gymnasium has it, and else "Disabled".
-      seed: of all that is drawn.
+      seed: of all that is drawn, below 2**32.
 
     Returns:
       An Agent.
@@ -86,7 +86,7 @@ def agent(
     check_record("random_planner", random_planner, Planner)
     check_functions("reward_data", reward_data, RewardData)
     check_count("capacity", capacity)
-    check_count("seed", seed, minimum=0)
+    check_count("seed", seed, 0, 2**32 - 1)  # JAX cuts off what is above
     if num_envs is not None:
         check_count("num_envs", num_envs)
     if params is not None:
@@ -127,7 +127,7 @@ class Agent:
         self._acting: Planner | None = None  # whose state is `_plan`
         self._plan: Any = ()
         self._acts: dict[Planner, ActFn] = {}
-        self._seen: list[tuple[np.ndarray, ...]] = []  # not yet in the dataset
+        self._seen = told.memory(cast(LearnerState, self._state).dataset)
         self.reset()
 
     @property
@@ -235,7 +235,8 @@ class Agent:
         obs, action = self._awaited
         is_finite = told.are_finite(obs, reached)
         kept = ~self._is_resetting & is_finite
-        self._seen.append((obs[kept], action[kept], reached[kept]))
+        if kept.any():
+            self._seen.append((obs[kept], action[kept], reached[kept]))
         steps = self._counts.steps + int(kept.sum())
         self._counts = self._counts._replace(steps=steps)
         self._awaited = None
@@ -283,7 +284,7 @@ class Agent:
           ValueError: naming what does not fit this agent.
         """
         self._state, self._counts = agent_file.read(path, self._state)
-        self._seen = []
+        self._seen.clear()
         self.reset()
 
     def _compiled(self, planner: Planner) -> ActFn:
@@ -294,7 +295,6 @@ class Agent:
 
     def _remember(self) -> None:
         """Moves what was seen to the dataset, in blocks of one size for one program."""
-        capacity = self._state.dataset.data.obs.shape[0]
-        for rows, count in told.blocks(self._seen, min(_BLOCK, capacity)):
+        for rows, count in told.blocks(self._seen, _BLOCK):
             self._state = self._append(self._state, rows, count)
-        self._seen = []
+        self._seen.clear()

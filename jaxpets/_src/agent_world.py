@@ -1,12 +1,16 @@
 """What an agent is told by a world that is not JAX: checked, and as arrays of NumPy."""
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpets._src.types import Transition
+from jaxpets._src.types import Dataset, Transition
+
+# What was observed and is not yet in the dataset: obs, action, next_obs of each step.
+Seen = deque[tuple[np.ndarray, ...]]
 
 AUTORESETS = ("Disabled", "NextStep", "SameStep")
 
@@ -114,6 +118,9 @@ def last_obs(
     reached = numbers(world, "next_obs", next_obs)
     if world.autoreset != "SameStep" or not done.any():
         return reached
+    if not isinstance(info, (Mapping, type(None))):  # pyright: ignore[reportUnnecessaryIsInstance]
+        kind = type(info).__name__
+        raise TypeError(f"info must be a dict that has final_obs, got {kind}.")
     found = (info or {}).get("final_obs")
     if found is None:
         raise ValueError(
@@ -130,18 +137,27 @@ def last_obs(
     return numbers(world, "info['final_obs']", rows)
 
 
-def blocks(
-    steps: list[tuple[np.ndarray, ...]], size: int
-) -> Iterator[tuple[Transition, np.int32]]:
+def memory(dataset: Dataset) -> Seen:
+    """Returns where steps wait for a dataset, each with a row at least.
+
+    It would replace all but the last of them, and may not be asked for long: a robot
+    that performs learns nothing.
+    """
+    capacity: int = dataset.data.obs.shape[0]
+    return deque(maxlen=capacity)
+
+
+def blocks(seen: Seen, size: int) -> Iterator[tuple[Transition, np.int32]]:
     """Yields rows in blocks of one size, the last filled up, and how many are meant.
 
     Args:
-      steps: `[n, D]`, `[n, A]`, `[n, D]` each, with any n.
-      size: of a block.
+      seen: steps `[n, D]`, `[n, A]`, `[n, D]` each, with any n.
+      size: of a block; the capacity if that is less.
     """
-    if not steps:
+    if not seen:
         return
-    rows = [np.concatenate(column) for column in zip(*steps, strict=True)]
+    size = min(size, seen.maxlen or size)
+    rows = [np.concatenate(column) for column in zip(*seen, strict=True)]
     for start in range(0, len(rows[0]), size):
         part = [column[start : start + size] for column in rows]
         count = len(part[0])

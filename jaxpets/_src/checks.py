@@ -5,8 +5,8 @@ Every message names the argument, what was wanted and what came.
 
 import difflib
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, TypeGuard, cast
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeGuard, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,20 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+T = TypeVar("T")
 
-def check_count(name: str, value: Any, minimum: int = 1) -> None:
-    """Raises unless `value` is a Python integer of at least `minimum`."""
+
+def check_count(
+    name: str, value: Any, minimum: int = 1, maximum: float = math.inf
+) -> None:
+    """Raises unless `value` is a Python integer in `[minimum, maximum]`."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python int, got {value!r} ({kind}).")
     if value < minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
+    if value > maximum:
+        raise ValueError(f"{name} must be at most {maximum}, got {value}.")
 
 
 def is_sequence(values: Any) -> TypeGuard[Sequence[Any]]:
@@ -108,6 +114,17 @@ def check_record(name: str, value: Any, record: type) -> None:
         kind = type(value).__name__
         article = "an" if record.__name__[0] in "AEIOU" else "a"
         raise TypeError(f"{name} must be {article} {record.__name__}, got {kind}.")
+
+
+def check_records(name: str, values: Any, record: type[T]) -> tuple[T, ...]:
+    """Returns instances of `record` as a tuple, or raises."""
+    if not isinstance(values, Iterable):
+        kind = type(values).__name__
+        raise TypeError(f"{name} must be a tuple of {record.__name__}, got {kind}.")
+    found = tuple(cast(Iterable[T], values))
+    for i, value in enumerate(found):
+        check_record(f"{name}[{i}]", value, record)
+    return found
 
 
 def check_callable(name: str, value: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets._src.checks import check_flag, check_record, nearest, plain_number
+from jaxpets._src.checks import check_flag, check_records, nearest, plain_number
 from jaxpets._src.types import Coordinate, ModelSpace
 
 KINDS = ("relative", "absolute", "angle", "quaternion")
@@ -49,7 +49,7 @@ def space(coordinates: Sequence[Coordinate]) -> ModelSpace:
     Raises:
       TypeError, ValueError: naming the entry that cannot be, and why.
     """
-    rows = tuple(coordinates)
+    rows = check_records("coordinates", coordinates, Coordinate)
     _check(rows)
     blocks = _blocks(rows)
     inputs = [block for block in blocks if block.is_input]
@@ -81,30 +81,35 @@ def index(coordinates: Sequence[Coordinate], name: str) -> int:
     Rewards and plots use it in place of a number: `obs[..., index(rows, "qpos/z")]`.
 
     Raises:
-      ValueError: if there is no such entry; the nearest names are said.
+      TypeError, ValueError: if there is no such entry; the nearest names are said. Or
+        if these are no entries, or none.
     """
-    names = [row.name for row in coordinates]
+    rows = check_records("coordinates", coordinates, Coordinate)
+    names = [row.name for row in rows]
     if name in names:
         return names.index(name)
+    if not names:
+        raise ValueError(f"coordinates must have the entry {name!r}, but have none.")
     near = ", ".join(nearest(name, names) or names)
     raise ValueError(f"name must be an entry, as {near}, got {name!r}.")
 
 
 def table(coordinates: Sequence[Coordinate]) -> str:
     """Returns the entries as text to print, one a line."""
-    width = max((len(row.name) for row in coordinates), default=0)
+    rows = check_records("coordinates", coordinates, Coordinate)
+    width = max((len(row.name) for row in rows), default=0)
     lines = [
         f"{i:3}  {row.name:{width}}  {row.kind:10}"
         f"  {'input' if row.is_input else '':5}  {'bounded' if row.is_bounded else ''}"
-        for i, row in enumerate(coordinates)
+        for i, row in enumerate(rows)
     ]
     return "\n".join(line.rstrip() for line in lines)
 
 
 def to_json(coordinates: Sequence[Coordinate]) -> str:
     """Returns the entries as JSON, a list of objects with the fields of Coordinate."""
-    rows = [row._asdict() for row in coordinates]
-    return json.dumps(rows, default=plain_number)
+    rows = check_records("coordinates", coordinates, Coordinate)
+    return json.dumps([row._asdict() for row in rows], default=plain_number)
 
 
 def from_json(text: str) -> tuple[Coordinate, ...]:
@@ -129,8 +134,7 @@ def _has(row: Any, fields: set[str]) -> bool:
 
 def _check(rows: tuple[Coordinate, ...]) -> None:
     seen: set[str] = set()
-    for i, row in enumerate(rows):
-        check_record(f"coordinates[{i}]", row, Coordinate)
+    for row in rows:
         if not isinstance(row.name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(f"names of coordinates must be texts, got {row.name!r}.")
         where = f"of entry {row.name!r}"

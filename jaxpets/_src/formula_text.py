@@ -6,11 +6,11 @@ import keyword
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
-from jaxpets._src.checks import check_count, nearest
+from jaxpets._src.checks import check_count, check_records, check_text, nearest
 from jaxpets._src.formula import OPERATIONS, Formula
 from jaxpets._src.formula_program import FormulaError, Node, Program, fail
 from jaxpets._src.types import Coordinate
@@ -67,27 +67,39 @@ def names(
       Words and the places of their entries, in the order given.
 
     Raises:
-      ValueError: if an alias is of an entry that is none; the last would be read for
-        it, without a word.
+      TypeError, ValueError: if these are no entries, or an alias is of an entry that is
+        none; the last would be read for it, without a word.
 
     >>> names([Coordinate("qvel/rootx"), Coordinate("qpos/root.z")], {"velocity": 0})
     {'qvel_rootx': 0, 'qpos_root_z': 1, 'velocity': 0}
     """
-    for alias, place in (aliases or {}).items():
-        check_count(f"aliases[{alias!r}]", place, minimum=0)
-        if place >= len(coordinates):
+    rows = check_records("coordinates", coordinates, Coordinate)
+    others = _places("aliases", {} if aliases is None else aliases)
+    for alias, place in others.items():
+        if place >= len(rows):
             raise ValueError(
-                f"aliases[{alias!r}] must be one of {len(coordinates)} entries, "
-                f"got {place}."
+                f"aliases[{alias!r}] must be one of {len(rows)} entries, got {place}."
             )
     found: dict[str, int] = {}
-    entries = [(row.name, i) for i, row in enumerate(coordinates)]
-    for name, place in [*entries, *(aliases or {}).items()]:
+    entries = [(row.name, i) for i, row in enumerate(rows)]
+    for name, place in [*entries, *others.items()]:
         word = re.sub(r"\W", "_", name, flags=re.ASCII)
         word = word if word[:1].isalpha() or word[:1] == "_" else f"_{word}"
         while _is_taken(word) or found.get(word, place) != place:
             word += "_"
         found[word] = place
+    return found
+
+
+def _places(name: str, words: Any) -> Mapping[str, int]:
+    """Returns an argument that is places of entries by words, or raises."""
+    if not isinstance(words, Mapping):
+        kind = type(words).__name__
+        raise TypeError(f"{name} must be places by words, as a dict, got {kind}.")
+    found = cast(Mapping[str, int], words)
+    for word, place in found.items():
+        check_text(f"a word of {name}", word)
+        check_count(f"{name}[{word!r}]", place, minimum=0)
     return found
 
 
@@ -135,11 +147,10 @@ def parse(text: str, names: Mapping[str, int], action_size: int = 0) -> Formula:
     if not isinstance(text, str):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"text must be a str, got {text!r}.")
     check_count("action_size", action_size, 0)
-    for word, place in names.items():
-        check_count(f"names[{word!r}]", place, 0)
+    words = _places("names", names)
     actions = {f"action_{i}": i for i in range(action_size)}
     try:
-        tree = _Reader(names, actions).read(_tree(text))
+        tree = _Reader(words, actions).read(_tree(text))
         return Program().formula(tree)
     except RecursionError as error:  # where the caller has used up the stack
         raise FormulaError("This is nested too deeply.", 0) from error

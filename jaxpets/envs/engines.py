@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets.envs.extra import needs_extra
-from jaxpets.envs.native import native_physics, native_readings
+from jaxpets.envs.native import check_state, native_physics, native_readings
 
 
 class Physics(NamedTuple):
@@ -56,16 +56,25 @@ def native_engine(
         model, num_substeps=num_substeps, num_threads=num_threads
     )
     read_fn = native_readings(model, places, num_threads=num_threads)
-    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    clip = _clip_fn(model)
 
     def advance(before: Physics, action: Array) -> Physics:
-        # MuJoCo clips as well, but takes an infinite control for 0.
-        return Physics(*physics_fn(*before, jnp.clip(action, low, high)))
+        return Physics(*physics_fn(*before, clip(action)))
 
     def read(physics: Physics, action: Array) -> Array:
-        return read_fn(*physics, jnp.clip(action, low, high))
+        return read_fn(*physics, clip(action))
 
     return Engine(advance, read)
+
+
+def _clip_fn(model: Any) -> Callable[[Array], Array]:
+    """Returns what brings an action into the range of the actuators.
+
+    MuJoCo clips as well, unless a model's flag says that it must not; and C MuJoCo
+    takes an infinite control for 0.
+    """
+    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+    return lambda action: jnp.clip(action, low, high)
 
 
 def mjx_engine(
@@ -73,28 +82,34 @@ def mjx_engine(
 ) -> Engine:
     """Builds physics in MJX, with the settings of the model's solver.
 
+    Actions are clipped as `native_engine` does.
+
     Raises:
-      ValueError: if the model uses what MJX does not have.
+      ValueError: if the model uses what MJX does not have, or has a state that Physics
+        does not have.
     """
+    check_state(model)
     # MJX writes to stdout when it finds no warp, which it does not need here.
     with needs_extra(), contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
 
     try:
-        device_model = mjx.put_model(model, impl="jax")
-        template = mjx.make_data(model, impl="jax")
+        with _as_mjx_needs():
+            device_model = mjx.put_model(model, impl="jax")
+            template = mjx.make_data(model, impl="jax")
     except NotImplementedError as error:
         raise ValueError(f"MJX lacks what this model uses: {error}.") from error
     mjx_step = cast(Callable[[Any, Any], Any], mjx.step)
     mjx_forward = cast(Callable[[Any, Any], Any], mjx.forward)
     subtree_vel = cast(Callable[[Any, Any], Any], mjx.subtree_vel)
+    clip = _clip_fn(model)
 
     def data_of(physics: Physics, action: Array) -> Any:
         data = template.replace(
             qpos=physics.qpos,
             qvel=physics.qvel,
             qacc_warmstart=physics.qacc_warmstart,
-            ctrl=action,
+            ctrl=clip(action),
         )
         return data.replace(act=physics.act) if model.na else data
 
@@ -124,9 +139,10 @@ def _as_mjx_needs() -> Generator[None]:
     """Traces MJX in float32, whatever a caller has set.
 
     GPUs multiply in TF32 by default: an error 400 times that of float32. And MJX does
-    not trace under strict promotion.
+    not trace under strict promotion, and under x64 returns other types than it takes.
     """
     with (
+        jax.enable_x64(False),
         jax.default_matmul_precision("highest"),
         jax.numpy_dtype_promotion("standard"),
     ):

@@ -1,5 +1,7 @@
 """Any robot: an environment from an MJCF, its entries named and its space derived."""
 
+import copy
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -59,7 +61,7 @@ def mujoco_env(
     state that was reached and the action that led there.
 
     Args:
-      model: a path to an MJCF, its text, or a compiled MuJoCo model.
+      model: a path to an MJCF, its text, or a compiled MuJoCo model as it is now.
       observe: what is observed, by the names that `observations.readings` explains; by
         default all joints, but not where the robot stands if nothing depends on it.
       control_step: in s, a multiple of the model's time step.
@@ -67,8 +69,8 @@ def mujoco_env(
         environment takes as long.
       reset: names of keyframes, of which a trial starts at one at random; or `(key) ->
         (qpos [Q], qvel [V])`, whose quaternions are made unit; or None for the model's
-        own start. All but the function's are within 0.001 of what was named, and have
-        its activations; from the function's they are 0.
+        own start. All but the function's are off what was named by normal noise, of
+        0.001 standard deviation, and have its activations; the function's have none.
       terminal_fn: `(obs [..., D]) -> bool [...]`, whether a trial ends there; None for
         never.
       settle_time: for how long physics goes on from there, with controls of zero, until
@@ -84,9 +86,9 @@ def mujoco_env(
 
     Raises:
       TypeError, ValueError: naming what cannot be: a model that does not compile or has
-        no actuator or one without a range, a name that is no entry, a time that is no
-        multiple, a function or a number of threads that is none, or what the backend
-        lacks.
+        no actuator or one without a finite range, a name that is no entry, a time that
+        is no multiple, a function or a number of threads that is none, or what the
+        backend lacks.
       FileNotFoundError: if there is no such file.
     """
     for name, function in (("terminal_fn", terminal_fn), ("constants", constants)):
@@ -95,7 +97,8 @@ def mujoco_env(
     if num_threads is not None:
         check_count("num_threads", num_threads)
     check_real("settle_time", settle_time, 0.0)
-    model = load_model(model)
+    # C MuJoCo reads it at every step, and whoever has it may make another robot of it.
+    model = copy.copy(load_model(model))
     found = readings(model, observe)
     coordinates = space([reading.coordinate for reading in found]).coordinates
     low, high = _action_range(model)
@@ -149,9 +152,10 @@ def load_model(model: Any) -> Any:
     if not isinstance(model, (str, Path)):
         kind = type(model).__name__
         raise TypeError(f"model must be a path, MJCF or an MjModel, got {kind}.")
-    is_text = str(model).lstrip().startswith("<")
+    # The text of a file may begin with a byte-order mark, which MuJoCo passes over.
+    is_text = str(model).lstrip("\ufeff \t\r\n").startswith("<")
     where = "this text" if is_text else str(model)
-    if not is_text and not Path(model).is_file():
+    if not is_text and not os.path.isfile(model):  # False as well for what is too long
         raise FileNotFoundError(f"model must be a file or MJCF, but {where} is none.")
     load = _C.MjModel.from_xml_string if is_text else _C.MjModel.from_xml_path
     try:
@@ -164,17 +168,37 @@ def load_model(model: Any) -> Any:
 
 
 def _action_range(model: Any) -> tuple[Array, Array]:
-    """Returns the least and greatest control of every actuator, `[A]` both."""
+    """Returns the least and greatest value of every control, `[A]` both."""
     if not model.nu:
         raise ValueError("model must have an actuator, got none.")
-    for actuator in range(model.nu):
-        if not model.actuator_ctrllimited[actuator]:
-            name = model.actuator(actuator).name or f"actuator{actuator}"
+    with np.errstate(over="ignore"):  # what is too large is refused below
+        limits = np.asarray(model.actuator_ctrlrange, np.float32)
+    owners = _control_names(model)
+    controls = zip(owners, model.actuator_ctrllimited, limits, strict=True)
+    for name, is_limited, (least, most) in controls:
+        if not is_limited:
             raise ValueError(
                 f"every actuator must have a ctrlrange, but {name} has none."
             )
-    low, high = jnp.asarray(model.actuator_ctrlrange, jnp.float32).T
+        if not -np.inf < least < most < np.inf:
+            raise ValueError(
+                "every ctrlrange must go from a finite number to a greater one, but "
+                f"that of {name} is {least:g} to {most:g}."
+            )
+    low, high = jnp.asarray(limits).T
     return low, high
+
+
+def _control_names(model: Any) -> list[str]:
+    """Returns whose each control is: of MuJoCo 4 on one may have several, or none."""
+    count = len(model.actuator_trntype)
+    sizes = getattr(model, "actuator_ctrlnum", np.ones(count, np.int32))
+    found: list[str] = []
+    for i, size in enumerate(sizes):
+        name = model.actuator(i).name or f"actuator{i}"
+        own = [f"control {k} of {name}" for k in range(size)]
+        found += own if size > 1 else [name] * size
+    return found
 
 
 def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:

@@ -65,12 +65,8 @@ def native_physics(
         state of the model is its positions, velocities and activations.
     """
     check_count("num_substeps", num_substeps)
+    check_state(model)
     c: Any = mujoco
-    known = 1 + model.nq + model.nv + model.na
-    if c.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != known:
-        raise ValueError(
-            "model must have no state but positions, velocities and activations."
-        )
     ends = np.cumsum([model.nq, model.nv, model.na, model.nv]).tolist()
     size = ends[-1]
 
@@ -96,6 +92,19 @@ def native_physics(
         )
 
     return step
+
+
+def check_state(model: Any) -> None:
+    """Raises if physics goes on from more than positions, velocities and activations.
+
+    As from what a control was some time ago, where an actuator has a delay.
+    """
+    c: Any = mujoco
+    known = 1 + model.nq + model.nv + model.na
+    if c.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != known:
+        raise ValueError(
+            "model must have no state but positions, velocities and activations."
+        )
 
 
 def _packed(

@@ -63,7 +63,8 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
       observe: names.
 
     Raises:
-      TypeError, ValueError: if a name is none of the model; the nearest are said.
+      TypeError, ValueError: if a name is none of the model; the nearest are said. Or if
+        it is of a clock, as a state has no time.
     """
     if not is_sequence(observe):
         raise TypeError(f"observe must be a sequence of names, got {observe!r}.")
@@ -79,7 +80,22 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
         found += chosen
     if not found:
         raise ValueError(f"observe must name an entry of the model, got {observe!r}.")
+    for reading in found:
+        if reading.source == "sensordata" and reading.place in _clocks(model):
+            name = reading.coordinate.name
+            raise ValueError(
+                f"observe must be of a state, which has no time, but {name} is a clock."
+            )
     return tuple(found)
+
+
+def _clocks(model: Any) -> list[int]:
+    """Returns where sensors that read the time are in sensordata.
+
+    Physics is stepped from its positions and velocities, so they would stand still.
+    """
+    kind = int(_C.mjtSensor.mjSENS_CLOCK)
+    return [int(place) for place in model.sensor_adr[model.sensor_type == kind]]
 
 
 def _chosen(groups: dict[str, list[Reading]], name: str) -> list[Reading]:
@@ -119,7 +135,7 @@ def _groups(model: Any, shifts: set[int]) -> dict[str, list[Reading]]:
         "mean_qvel": mean,
         "qpos": qpos,
         "qvel": qvel,
-        "act": [r for i in range(model.nu) for r in _activations(model, i)],
+        "act": [r for i in _actuators(model) for r in _activations(model, i)],
         "sensordata": [
             r for i in range(model.nsensor) for r in _sensor(model, i, shifts)
         ],
@@ -177,6 +193,11 @@ def _velocities(model: Any, joint: int) -> list[Reading]:
         Reading("qvel", start + i, Coordinate(f"{name}.{part}" if part else name))
         for i, part in enumerate(parts)
     ]
+
+
+def _actuators(model: Any) -> range:
+    """Returns their numbers; of MuJoCo 4 on, one may have several controls, or none."""
+    return range(len(model.actuator_trntype))
 
 
 def _activations(model: Any, actuator: int) -> list[Reading]:

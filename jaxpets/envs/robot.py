@@ -124,7 +124,9 @@ def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:
             chosen, constants = params
         reward = jnp.zeros((), jnp.float32)
         for i, name in enumerate(names):
-            own = rewards[name](constants, obs, action, next_obs)
+            own: Any = rewards[name](constants, obs, action, next_obs)
+            if own is None:
+                raise TypeError(f"rewards[{name!r}] must return a reward, got None.")
             reward = jnp.where(chosen == i, own, reward)
         return reward
 

@@ -64,15 +64,34 @@ def _is_held(model: Any, joint: int) -> bool:
 
 
 def _is_tied_to_world(model: Any) -> bool:
-    """Whether a tendon or an equality leads to what stands still.
+    """Whether a tendon, an actuator or an equality leads to what stands still.
 
     An equality between frames counts as one: which of them are fixed is not looked at.
     """
-    sites = model.wrap_objid[model.wrap_type == int(_C.mjtWrap.mjWRAP_SITE)]
-    fixed = model.body_weldid[model.site_bodyid[sites]] == 0
+    sites = np.concatenate([_wrapped(model, "SITE"), _driven_sites(model)])
+    geoms = np.concatenate([_wrapped(model, "SPHERE"), _wrapped(model, "CYLINDER")])
+    bodies = np.concatenate([model.site_bodyid[sites], model.geom_bodyid[geoms]])
+    fixed = model.body_weldid[bodies] == 0
     frames = (_C.mjtEq.mjEQ_JOINT, _C.mjtEq.mjEQ_TENDON)
     tied = ~np.isin(model.eq_type, [int(kind) for kind in frames])
     return bool(fixed.any() or tied.any())
+
+
+def _wrapped(model: Any, kind: str) -> np.ndarray:
+    """Returns the things of a kind that a tendon runs by."""
+    code = int(getattr(_C.mjtWrap, f"mjWRAP_{kind}"))
+    return model.wrap_objid[model.wrap_type == code]
+
+
+def _driven_sites(model: Any) -> np.ndarray:
+    """Returns the sites between which an actuator acts.
+
+    One that acts on a site alone, with no other to refer to, is not among them.
+    """
+    kinds = (_C.mjtTrn.mjTRN_SITE, _C.mjtTrn.mjTRN_SLIDERCRANK)
+    acts = np.isin(model.actuator_trntype, [int(kind) for kind in kinds])
+    pairs = model.actuator_trnid[acts]
+    return pairs[(pairs >= 0).all(axis=1)].ravel()
 
 
 def _is_along(model: Any, axis: np.ndarray) -> bool:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ with needs_extra():
 
 _C: Any = mujoco  # its names are made at import, where pyright does not see them
 _RESET_STD = 0.001  # as PETS starts HalfCheetah
+_NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 
 # `(key) -> (qpos [Q], qvel [V])`.
 ResetFn = Callable[[Array], tuple[Array, Array]]
@@ -83,11 +84,16 @@ def _check_mocap(model: Any, chosen: Sequence[int]) -> None:
 
 
 def unit_quaternions(model: Any, qpos: Array) -> Array:
-    """Returns positions whose quaternions are unit."""
+    """Returns positions whose quaternions are unit; one of zeros turns nothing.
+
+    So MuJoCo reads it, too.
+    """
     free, ball = int(_C.mjtJoint.mjJNT_FREE), int(_C.mjtJoint.mjJNT_BALL)
     for kind, start in zip(model.jnt_type, model.jnt_qposadr, strict=True):
         if kind in (free, ball):
             first = int(start) + (3 if kind == free else 0)
             part = qpos[first : first + 4]
-            qpos = qpos.at[first : first + 4].set(part / jnp.linalg.norm(part))
+            size = cast(Array, jnp.linalg.norm(part))
+            unit = jnp.where(size > 0.0, part / size, _NO_TURN)
+            qpos = qpos.at[first : first + 4].set(unit)
     return qpos

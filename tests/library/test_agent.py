@@ -137,6 +137,21 @@ def test_it_explores_at_random_learns_plans_and_goes_on_where_it_was_saved(
         make(capacity=3).load(path)
 
 
+def test_what_waits_to_be_learned_is_no_more_than_the_capacity(make, trained):
+    """A robot that performs for days learns nothing, and needs no more room for it."""
+    agent = make(params=trained, capacity=3)
+    for step in range(10):
+        agent.act(at(step))
+        agent.observe(at(step + 1))
+    assert len(agent._seen) == 3 and agent.num_steps == 10
+    assert rows(agent) == [(7, 8), (8, 9), (9, 10)]
+    two = make(params=trained, capacity=3, num_envs=2)
+    for step in range(10):  # one of them diverges, and both do in between
+        two.act([at(step), at(step)])
+        two.observe([at(np.nan), at(step + 1 if step % 3 else np.nan)])
+    assert sorted(rows(two)) == [(5, 6), (7, 8), (8, 9)] and two.num_steps == 6
+
+
 def test_a_file_that_is_no_agent_is_refused(make, trained, tmp_path):
     path = tmp_path / "m"
     agent = make(params=trained)
@@ -299,6 +314,10 @@ def test_what_a_world_may_not_say(make, trained):
     ended = np.array([True, False])
     with pytest.raises(ValueError, match="info must have final_obs"):
         two.observe(np.zeros((2, 2)), ended)
+    with pytest.raises(
+        TypeError, match="info must be a dict that has final_obs, got list"
+    ):
+        two.observe(np.zeros((2, 2)), ended, info=[{"final_obs": at(0)}, {}])
     with pytest.raises(ValueError, match="must have 2 rows, got 1"):
         two.observe(np.zeros((2, 2)), ended, info={"final_obs": [at(0)]})
 
@@ -328,6 +347,9 @@ def test_a_world_that_diverges_does_not_stop_the_others(make, trained, mode):
 def test_what_an_agent_may_not_be_made_of(make, parts):
     with pytest.raises(ValueError, match=r"autoreset must be one of .*, got 'never'"):
         make(autoreset="never")
+    for seed in (2**32, 2**70):  # the first would be the seed 0, without a word
+        with pytest.raises(ValueError, match="seed must be at most 4294967295, got"):
+            make(seed=seed)
     with pytest.raises(ValueError, match="num_envs must be at least 1"):
         make(num_envs=0)
     with pytest.raises(ValueError, match="params must"):

@@ -130,6 +130,29 @@ def test_entries_have_places_and_unknown_names_near_ones():
         coordinates.index(ROWS, "!!")
 
 
+@pytest.mark.parametrize(
+    "function",
+    [
+        coordinates.space,
+        coordinates.table,
+        coordinates.to_json,
+        lambda rows: coordinates.index(rows, "speed"),
+    ],
+)
+def test_what_is_no_table_is_refused(function):
+    """As an environment in place of its coordinates."""
+    env = jaxpets.Env(SPACE.target, SPACE.target, np.ones(1), np.ones(1), ROWS)
+    with pytest.raises(TypeError, match=r"coordinates\[0\] must be a Coor.* got func"):
+        function(env)
+    with pytest.raises(TypeError, match="must be a tuple of Coordinate, got int"):
+        function(3)
+
+
+def test_no_entry_is_found_where_there_is_none():
+    with pytest.raises(ValueError, match="must have the entry 'speed', but have none"):
+        coordinates.index((), "speed")
+
+
 def test_a_table_goes_to_text_and_back():
     assert coordinates.from_json(coordinates.to_json(ROWS)) == ROWS
     lines = coordinates.table(ROWS).splitlines()

@@ -260,6 +260,14 @@ def test_other_arguments_are_checked():
         TypeError, match=r"aliases\['x'\] must be a Python int, got 'a'"
     ):
         formulas.names(rows, {"x": "a"})
+    with pytest.raises(TypeError, match=r"coordinates\[0\] must be a Coord.*, got str"):
+        formulas.names(["a", "b"])
+    with pytest.raises(TypeError, match=r"aliases must be places .*, got list"):
+        formulas.names(rows, ["a"])
+    with pytest.raises(TypeError, match=r"names must be places .*, got list"):
+        formulas.parse("a", rows)  # what formulas.names makes words of
+    with pytest.raises(TypeError, match="a word of names must be a text, got 1"):
+        formulas.parse("a", {1: 0})
     with pytest.raises(TypeError, match="formula must be a Formula, got str"):
         formulas.reward("velocity", OBS, ACTION, NEXT_OBS)
 

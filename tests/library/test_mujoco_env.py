@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import robots
+import toys
 
 import jaxpets
 from jaxpets import coordinates
@@ -108,6 +109,30 @@ def test_one_step_on_mjx_is_that_of_c(key):
     np.testing.assert_allclose(got.physics.act, want.physics.act, rtol=1e-6)
 
 
+def test_mjx_steps_in_float32_where_a_caller_computes_in_float64(key):
+    def trial():
+        observe = (*DEFAULT, "site_xpos/tip")
+        env = mujoco_env(SLOW_CART, observe=observe, control_step=0.004, backend="mjx")
+        return rolled(env, key, 3)
+
+    with jax.enable_x64(True):
+        got = trial()
+    # The same program but for its counters, compiled twice.
+    toys.assert_trees_close(got, trial(), rtol=1e-5, atol=1e-6)
+    assert {x.dtype for x in jax.tree.leaves(got)} == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+def test_an_action_stays_in_its_range_whatever_a_flag_says(backend, key):
+    flag = '<mujoco><option><flag clampctrl="disable"/></option>'
+    env = mujoco_env(
+        CART.replace("<mujoco>", flag), control_step=0.002, backend=backend
+    )
+    start, step = env.reset(key), jax.jit(env.step)
+    far, most = (step(start, jnp.full((1,), x)).obs for x in (3.0, 1.0))
+    np.testing.assert_array_equal(far, most)
+
+
 def test_activations_are_state_and_are_observed(key):
     env = mujoco_env(SLOW_CART, control_step=0.02, observe=("act/push", "qpos"))
     model = mujoco.MjModel.from_xml_string(SLOW_CART)
@@ -127,6 +152,26 @@ def test_activations_are_state_and_are_observed(key):
     row = env.coordinates[0]
     assert row == Coordinate("act/push", "relative", True, True)
     assert hc.half_cheetah_native().reset(key).physics.act == ()
+
+
+@pytest.mark.skipif(
+    mujoco.mj_version() < 4_000_000, reason="an actuator has one control before 4.0"
+)
+def test_an_actuator_may_have_several_controls_or_none(key):
+    """A servo of place and speed, a passive motor, and one with an activation."""
+    servo = '<pid name="servo" joint="hinge" kp="1" kv="1" input="pos vel" {}/>'
+    passive = '<dcmotor joint="hinge" motorconst="1" resistance="1" input="none"/>'
+    added = f"<actuator>{servo}{passive}{passive}"
+    limited = added.format('ctrlrange="-3 3" velrange="-2 2"')
+    env = mujoco_env(SLOW_CART.replace("<actuator>", limited))
+    assert [row.name for row in env.coordinates][-1] == "act/push"
+    np.testing.assert_array_equal(env.action_low, [-3, -2, -1])
+    start = env.reset(key)
+    still, pushed = (env.step(start, jnp.array([0.0, 0.0, x])).obs for x in (0.0, 1.0))
+    assert still[-1] == 0.0 and pushed[-1] > 0.3
+    half = added.format('ctrlrange="-3 3"')
+    with pytest.raises(ValueError, match="but control 1 of servo has none"):
+        mujoco_env(SLOW_CART.replace("<actuator>", half))
 
 
 def test_a_trial_settles_and_has_constants(key):
@@ -215,6 +260,16 @@ def test_a_start_may_be_of_numpy(key):
     np.testing.assert_allclose(physics.qpos[3:7], [0.5] * 4)
 
 
+def test_a_start_of_zeros_turns_nothing(key):
+    def own(key):
+        del key
+        return jnp.zeros(12), jnp.zeros(10)
+
+    physics = mujoco_env(robots.FREE_XML, reset=own).reset(key).physics
+    want = [0.0] * 3 + [1.0, 0.0, 0.0, 0.0] + [0.0] + [1.0, 0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(physics.qpos, want)
+
+
 def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     path = tmp_path / "cart.xml"
     path.write_text(CART)
@@ -223,16 +278,40 @@ def test_a_model_is_a_path_a_text_or_itself(tmp_path, key):
     for given in (path, str(path), model):
         jax.tree.map(np.testing.assert_array_equal, mujoco_env(given).reset(key), want)
     assert load_model(model) is model
+    marked = tmp_path / "marked.xml"
+    marked.write_text(CART, encoding="utf-8-sig")
+    assert load_model(marked.read_text(encoding="utf-8")).nq == model.nq
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+def test_what_a_model_becomes_later_is_another_robot(backend, key):
+    model = load_model(CART)
+    env = mujoco_env(model, control_step=0.002, backend=backend)
+    start = env.reset(key)
+    model.body_mass[1:] *= 100.0
+    heavy = mujoco_env(model, control_step=0.002, backend=backend)
+    speed, slower = (
+        abs(x.step(start, jnp.ones(1)).physics.qvel[0] - start.physics.qvel[0])
+        for x in (env, heavy)
+    )
+    assert speed > 10 * slower
 
 
 NO_RANGE = CART.replace(' ctrlrange="-1 1"', "")
 BAD = {
     "model must be a path, MJCF or an MjModel, got int": (3, {}),
     "model must be a file or MJCF, but none.xml is none": ("none.xml", {}),
+    "model must be a file or MJCF, but a{5000} is none": ("a" * 5000, {}),
     "model must compile, but this text does not: XML": ("<mujoco><x/>", {}),
     "every actuator must have a ctrlrange, but push has none": (NO_RANGE, {}),
     "every actuator must have a ctrlrange, but actuator0 has none": (
         NO_RANGE.replace('name="push"', ""), {},
+    ),
+    "every ctrlrange must go from a finite .* but that of push is -inf to inf": (
+        CART.replace('"-1 1"', '"-inf inf"'), {},
+    ),
+    "every ctrlrange must go from a finite .* but that of actuator0 is 0 to inf": (
+        CART.replace('name="push"', "").replace('"-1 1"', '"0 1e39"'), {},
     ),
     "model must have an actuator, got none": (
         robots.mjcf('<body><joint/><geom size="1"/></body>'), {},
@@ -269,6 +348,9 @@ BAD = {
     ),
     'backend must be "mujoco" or "mjx", got \'warp\'': (CART, {"backend": "warp"}),
     "names of coordinates must differ": (CART, {"observe": ["qpos", "qpos"]}),
+    "model must have no state but positions, velocities and activations": (
+        CART.replace("<motor", '<motor delay="0.01" nsample="5"'), {"backend": "mjx"},
+    ),
     "MJX lacks what this model uses": (
         CART.replace("<worldbody>", '<option solver="PGS"/><worldbody>'),
         {"backend": "mjx"},

@@ -149,6 +149,17 @@ def test_nothing_to_observe_is_refused():
         readings(FREE, [])
 
 
+def test_a_clock_is_not_read():
+    """Steps keep no time, so that it would say the same in every state."""
+    sensors = '<sensor><jointpos joint="hip"/><clock name="now"/></sensor>'
+    model = robots.compiled(robots.FREE, sensors)
+    for observe in ("sensordata/now", "sensordata"):
+        with pytest.raises(ValueError, match="no time, but sensordata/now is a cl"):
+            readings(model, ["qpos", observe])
+    (bend,) = readings(model, ["sensordata/sensor0"])
+    assert bend.place == 0
+
+
 # -- symmetry ------------------------------------------------------------------------
 
 SHAPE = '<geom size="0.1"/>'
@@ -211,10 +222,34 @@ def test_what_something_pulls_at_is_kept(name):
     assert free_shifts(robots.compiled(bodies, TIES[name])) == []
 
 
-def test_a_tendon_to_the_world_holds():
-    tendon = '<spatial><site site="hook"/><site site="end"/></spatial>'
-    model = robots.compiled(SITE + TIED, f"<tendon>{tendon}</tendon>")
-    assert free_shifts(model) == []
+HOOKED = {
+    "a tendon": (
+        "<tendon><spatial><site site='hook'/><site site='end'/></spatial></tendon>"
+    ),
+    "a tendon around a post": (
+        "<tendon><spatial><site site='end'/><geom geom='post'/><site site='far'/>"
+        "</spatial></tendon>"
+    ),
+    "an actuator": (
+        "<actuator><position site='end' refsite='hook' gear='1 0 0 0 0 0'/></actuator>"
+    ),
+    "a crank": (
+        "<actuator><motor cranksite='end' slidersite='hook' cranklength='2'/>"
+        "</actuator>"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HOOKED)
+def test_what_leads_to_the_world_holds(name):
+    post = '<geom name="post" size="0.1" contype="0" conaffinity="0"/>'
+    far = '<site name="far" pos="1 0 0"/></body>'
+    bodies = SITE + post + TIED.replace("</body>", far)
+    assert free_shifts(robots.compiled(bodies, HOOKED[name])) == []
+    # Between two sites of the robot itself it holds nothing.
+    own = HOOKED[name].replace("hook", "far")
+    if "post" not in own:
+        assert free_shifts(robots.compiled(bodies, own)) == [0, 1]
 
 
 def test_nothing_changes_when_a_robot_is_shifted():

@@ -52,6 +52,14 @@ def test_tasks_are_one_reward_with_data():
     )
 
 
+def test_a_task_that_returns_nothing_is_named():
+    tasks = envs.tasks_of({"height": height, "none": lambda *step: None})
+    with pytest.raises(
+        TypeError, match=r"rewards\['none'\] must return a reward, got N"
+    ):
+        tasks.reward_fn(tasks.params[0], jnp.zeros(2), jnp.zeros(1), jnp.zeros(2))
+
+
 def test_what_is_no_robot_is_refused():
     with pytest.raises(ValueError, match=r"as pets/half_cheetah, .*got 'half_cheeta'"):
         envs.make("half_cheeta")
