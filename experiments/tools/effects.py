@@ -56,12 +56,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the results")
     args = parser.parse_args(argv)
     try:
-        rows = logs.load(args.runs[0])
-        for folder in args.runs[1:]:
-            rows += [
-                x._replace(arm=f"{x.arm}, {folder.name}") for x in logs.load(folder)
-            ]
-        rows = [row for row in rows if row.explored == args.explored]
+        rows = [
+            row._replace(arm=row.arm + name)
+            for folder, name in zip(args.runs, suite.names(args.runs), strict=True)
+            for row in logs.load(folder)
+            if row.explored == args.explored
+        ]
         found = results(rows, ceilings(args.ceilings))
         if args.json is not None:
             with storage_errors(f"write {args.json}"):

@@ -75,9 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         found: Results = {}
         variant = args.explored, args.tag
-        for i, path in enumerate(args.runs):
+        for path, name in zip(args.runs, names(args.runs), strict=True):
             own = read(path) if path.is_file() else results(path, *variant)
-            found |= {f"{arm}, {path.stem}" if i else arm: x for arm, x in own.items()}
+            found |= {arm + name: x for arm, x in own.items()}
         others = peers.read(args.peers)
         if args.than is not None and args.than not in found:
             raise UsageError(f"--than {args.than}: it is none of {', '.join(found)}.")
@@ -99,6 +99,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         lines = [*table(arms, others), "", *differences(arms, args.than)]
     print("\n".join(lines))
     return 0
+
+
+def names(paths: Sequence[Path]) -> list[str]:
+    """Returns what is added to the arms of folders and files, to the first's nothing.
+
+    That is the name of each, or its path where another one has that name.
+
+    Raises:
+      UsageError: if one is there twice.
+    """
+    own = [path.stem if path.is_file() else path.resolve().name for path in paths]
+    pairs = list(zip(paths, own, strict=True))[1:]
+    added = [str(path) if own[1:].count(x) > 1 else x for path, x in pairs]
+    if len(set(added)) < len(added):
+        raise UsageError("the same folder or file is given twice; give each once.")
+    return ["", *(f", {name}" for name in added)]
 
 
 def results(runs: Path, explored: int | None, tag: str) -> Results:
