@@ -1,6 +1,6 @@
 """A sample of the bench of faults, in exploration.
 
-Signals, and a disk that refuses one write, are met by the tests of runs and checkpoints.
+Signals, and a disk that refuses one write, are met by tests of runs and checkpoints.
 """
 
 import contextlib
