@@ -73,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--than", metavar="ARM", help=words)
     args = parser.parse_args(argv)
     try:
+        if args.figure is not None and args.figure.suffix not in (".png", ".svg"):
+            raise UsageError(f"--figure {args.figure} must end in .png or .svg.")
         found: Results = {}
         variant = args.explored, args.tag
         for path, name in zip(args.runs, names(args.runs), strict=True):
@@ -126,7 +128,7 @@ def results(runs: Path, explored: int | None, tag: str) -> Results:
       tag: of the variant of phase 2; empty for the one without.
 
     Raises:
-      RunError: if a log cannot be read, or there is none.
+      RunError: if a log cannot be read, or none has such a task.
     """
     rows = [row for row in logs.load(runs) if row.tag == tag]
     if explored is None:
@@ -142,6 +144,10 @@ def results(runs: Path, explored: int | None, tag: str) -> Results:
                 if task in scores:
                     own_numbers = numbers(scores[task], steps)
                     found.setdefault(arm, {})[_name(domain, task)] = own_numbers
+    if not found:
+        which = f" as variant {tag}" * bool(tag)
+        which += f" after {explored} trials" * bool(explored)
+        raise UsageError(f"no run in {runs} has performed tasks of the suite{which}.")
     return found
 
 

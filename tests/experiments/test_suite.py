@@ -186,6 +186,18 @@ def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
     assert f"{path} has no numbers of others" in capsys.readouterr().err
 
 
+def test_a_file_of_results_is_not_replaced_by_nothing(runs, tmp_path, peers, capsys):
+    path = tmp_path / "suite.json"
+    path.write_text("kept")
+    flags = ["--peers", peers, "--json", str(path)]
+    for other in (["--tag", "acter"], ["--explored", "5"], ["--figure", "x.xyz"]):
+        assert suite.main([str(runs), *flags, *other]) == 2
+    said = capsys.readouterr().err
+    assert "has performed tasks of the suite as variant acter." in said
+    assert "after 5 trials." in said and "must end in .png or .svg" in said
+    assert path.read_text() == "kept"
+
+
 def test_the_committed_numbers_of_others_are_of_every_task():
     peers = published.read(PEERS_FILE)
     assert {x.name for x in peers.systems} == set(peers.returns)
