@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import calling
+from . import calling, signals
 from .config import Science, Variant
 from .entries import entries
 from .errors import RunError, UsageError, storage_errors
@@ -143,4 +143,4 @@ def _explored(rows: Sequence[Row]) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

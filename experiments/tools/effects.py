@@ -8,7 +8,6 @@ was upright, and the return over the value of the plans, which is that of their 
 
 import argparse
 import itertools
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -290,4 +289,4 @@ def _one_apart(one: str, other: str) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

@@ -8,7 +8,6 @@ those that every arm has. With `--than ARM` the arms are those that have all its
 
 import argparse
 import statistics
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -278,4 +277,4 @@ def _of_seeds(own: Sequence[Mapping[str, Any]]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)
