@@ -49,6 +49,7 @@ _HALVES = {
     "domains that settings were chosen on": _CHOSEN,
     "the other domains": tuple(x for x in NAMES if x not in _CHOSEN),
 }
+_FIGURES = (".png", ".svg", ".pdf")
 Results = dict[str, dict[str, dict[str, Any]]]  # arm -> domain/task -> numbers
 
 
@@ -72,8 +73,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--than", metavar="ARM", help=words)
     args = parser.parse_args(argv)
     try:
-        if args.figure is not None and args.figure.suffix not in (".png", ".svg"):
-            raise UsageError(f"--figure {args.figure} must end in .png or .svg.")
+        if args.figure is not None and args.figure.suffix not in _FIGURES:
+            valid = f"it must end in {', '.join(_FIGURES)}"
+            raise UsageError(f"--figure {args.figure} is not valid; {valid}.")
         found: Results = {}
         variant = args.explored, args.tag
         for path, name in zip(args.runs, names(args.runs), strict=True):

@@ -194,7 +194,7 @@ def test_a_file_of_results_is_not_replaced_by_nothing(runs, tmp_path, peers, cap
         assert suite.main([str(runs), *flags, *other]) == 2
     said = capsys.readouterr().err
     assert "has performed tasks of the suite as variant acter." in said
-    assert "after 5 trials." in said and "must end in .png or .svg" in said
+    assert "after 5 trials." in said and "must end in .png, .svg" in said
     assert path.read_text() == "kept"
 
 
