@@ -1,5 +1,6 @@
 """What commands are called, in texts that name one: as the user has called this one."""
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -21,7 +22,8 @@ def usage(module: str, *words: object) -> str:
 
 def line(module: str, *words: object) -> str:
     """Returns a command that can be copied to a shell; see `usage`."""
-    return ("" if _is_command() else "python -m ") + usage(module, *words)
+    quoted = (shlex.quote(str(word)) for word in words)
+    return ("" if _is_command() else "python -m ") + usage(module, *quoted)
 
 
 def _is_command() -> bool:

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import calling
+from . import calling, signals
 from .config import Science, Variant
 from .entries import entries
-from .errors import RunError, UsageError
+from .errors import RunError, UsageError, storage_errors
 from .report import figures, logs, report, tables
 from .report.logs import Row, Scores
 from .storage import disk, rundir
@@ -57,7 +57,8 @@ def compared(runs: Mapping[str, Path], picture: Path) -> str:
         name: [row._replace(arm=_label(name, row)) for row in logs.load(path)]
         for name, path in runs.items()
     }
-    disk.make(picture.parent)
+    with storage_errors(f"make {picture.parent}"):
+        disk.make(picture.parent)
     rows = [row for own in by_run.values() for row in own]
     configs = {name: tables.flat(logs.config(path)) for name, path in runs.items()}
     places = {
@@ -142,4 +143,4 @@ def _explored(rows: Sequence[Row]) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

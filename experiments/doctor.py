@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from . import calling, requirements
+from . import calling, requirements, signals
 from .errors import RunError, printable
 from .requirements import Finding, Mark
 
@@ -233,4 +233,4 @@ def _free_memory() -> int | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

@@ -14,6 +14,7 @@ from .storage import rundir
 _NAME = msgspec.Meta(
     pattern=r"^[a-z][a-z-]*(\.[a-z-]+)*\Z", description="a flag's name"
 )
+_OWN = ("out", "name")  # of the sweep, which looks for its runs there
 Flags = dict[str, Any]  # a table in a table is a group: planner.horizon
 Plain = bool | int | float | str
 Grid = dict[Annotated[str, _NAME], Annotated[list[Any], msgspec.Meta(min_length=1)]]
@@ -167,6 +168,11 @@ def _flat(flags: Mapping[str, Any], group: str = "") -> dict[str, Any]:
 
 
 def _checked(name: str, value: Any) -> Any:
+    if name in _OWN:
+        raise UsageError(
+            f"{name} = {printable(repr(value))} is not valid as a flag; the `out` of "
+            "all runs is on top of the file, and their place in the grid names them."
+        )
     try:
         msgspec.convert(name, Annotated[str, _NAME])
         return msgspec.convert(value, Plain | list[Plain])

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from . import calling
+from . import calling, signals
 from .errors import CheckpointError, printable
 from .storage import rundir, status
 from .storage.status import Status
@@ -102,4 +102,4 @@ def _print(rows: Sequence[Sequence[str]]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

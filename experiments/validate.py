@@ -26,7 +26,7 @@ def validate(config: Config) -> None:
     require(unique, "--seeds", config.seeds, "one or more different seeds")
     _check_members(config)
     for name in ("planner", "task_planner"):
-        _check_planner(flag(name), getattr(config, name), config.model.num_members)
+        check_planner(flag(name), getattr(config, name), config.model.num_members)
     for name in ("training", "tuning"):
         epochs = getattr(config, name).num_epochs
         require(epochs > 0, f"--{name}.num-epochs", epochs, "1 to 10,000")
@@ -77,7 +77,8 @@ def _check_critic(config: Config) -> None:
         require(not has_policy, "--policy", config.policy, "None with a critic")
 
 
-def _check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:
+def check_planner(flag: str, planner: PlannerConfig, num_members: int) -> None:
+    """Refuses more elites than candidates, and particles that members cannot share."""
     require(
         planner.num_elites <= planner.num_samples or planner.optimizer == "mppi",
         f"{flag}.num-elites",

@@ -135,8 +135,8 @@ def _opened(options: Options) -> tuple[socket.socket, str]:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    return socket.create_server(address[:2], family=family)
+    family, *_, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+    return socket.create_server((address[0], port), family=family)
 
 
 def _keep_programs() -> None:

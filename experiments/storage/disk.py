@@ -85,10 +85,11 @@ def check_own(path: Path, *, folder: bool = False) -> None:
     Raises:
       StorageError: if it is a link, hard or soft, or of another kind.
     """
-    try:
-        status = path.lstat()
-    except FileNotFoundError:
-        return
+    with storage_errors(f"write {path}"):
+        try:
+            status = path.lstat()
+        except FileNotFoundError:
+            return
     if folder:
         good = stat.S_ISDIR(status.st_mode)
     else:

@@ -8,7 +8,6 @@ was upright, and the return over the value of the plans, which is that of their 
 
 import argparse
 import itertools
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,12 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the results")
     args = parser.parse_args(argv)
     try:
-        rows = logs.load(args.runs[0])
-        for folder in args.runs[1:]:
-            rows += [
-                x._replace(arm=f"{x.arm}, {folder.name}") for x in logs.load(folder)
-            ]
-        rows = [row for row in rows if row.explored == args.explored]
+        rows = [
+            row._replace(arm=row.arm + name)
+            for folder, name in zip(args.runs, suite.names(args.runs), strict=True)
+            for row in logs.load(folder)
+            if row.explored == args.explored
+        ]
         found = results(rows, ceilings(args.ceilings))
         if args.json is not None:
             with storage_errors(f"write {args.json}"):
@@ -290,4 +289,4 @@ def _one_apart(one: str, other: str) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

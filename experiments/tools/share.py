@@ -16,7 +16,7 @@ import jaxpets
 
 from .. import exploration, model_file
 from ..config import PlannerConfig
-from ..errors import RunError, storage_errors
+from ..errors import RunError, UsageError, storage_errors
 from ..presets import quick_search
 from ..storage import disk, rundir
 from ..storage.folder import RunFolder
@@ -99,16 +99,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = "zero-shots with it, for its card; by default those in the run's folder"
     parser.add_argument("--returns", type=Path, nargs="+", metavar="DIR", help=words)
     args = parser.parse_args(argv)
+    page = args.file.with_suffix(".md")
     options = {"env": args.env, "licence": args.licence, "half": args.half}
     try:
+        if args.file == page:
+            raise UsageError(
+                f"{page} is where the card goes; call the model otherwise."
+            )
         with storage_errors(f"write {args.file}"):
             args.file.parent.mkdir(parents=True, exist_ok=True)
             share(args.run, args.file, seed=args.seed, **options)
         said = card.text(args.file, args.run, args.returns)
+        disk.write(page, said.encode())
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
-    disk.write(page := args.file.with_suffix(".md"), said.encode())
     print(f"wrote {args.file} and {page}")
     return 0
 

@@ -21,11 +21,13 @@ from jaxpets.envs import Robot, Tasks, env_rollout, with_constants
 
 from .. import acting, robots
 from ..build import imagined_end, optimizer
-from ..config import EngineName, PlannerConfig
-from ..errors import RunError
+from ..config import EngineName, PlannerConfig, Steps, TaskTrials
+from ..entries import flag, read, to_json
+from ..errors import RunError, UsageError
 from ..presets import PRESETS, quick_search
 from ..storage import metrics, rundir
 from ..storage.environment import environment
+from ..validate import check_planner
 
 _PAPER = PRESETS["paper"]
 _SEARCH = quick_search(_PAPER)
@@ -43,9 +45,9 @@ class Arguments:
     """What is performed, as `walk,run`."""
     seed: int = 0
     """Of all keys."""
-    num_trials: int = 1
+    num_trials: TaskTrials = 1
     """Per task."""
-    trial_length: int = 1000
+    trial_length: Steps = 1000
     """Environment steps per trial."""
     engine: EngineName = "mujoco"
     """What steps the physics, imagined and real."""
@@ -93,10 +95,18 @@ def _chosen(args: Arguments, robot: Robot) -> Tasks:
     return robots.chosen(dataclasses.replace(_PAPER, task=args.task), robot)
 
 
+def _refused(name: str, value: Any, wanted: str | None) -> UsageError:
+    return UsageError(f"{flag(name)} {value} is not valid; it must be {wanted}.")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Performs, and prints a line per task; returns the exit code."""
     args = tyro.cli(Arguments, args=argv, prog=f"{__package__}.simulator")
     try:
+        read(Arguments, to_json(args), args, _refused)
+        check_planner("--task-planner", args.task_planner, 1)
+        if args.json is not None:
+            metrics.append_rows(args.json, [])  # before anything is computed
         robot = robots.named(args.env, args.engine, args.tasks)
         robots.check_tasks(dataclasses.replace(_PAPER, task=args.task), robot)
     except RunError as error:
@@ -124,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             }
             for i, value in enumerate(own.tolist())
         ]
-        if args.json:
+        if args.json is not None:
             metrics.append_rows(args.json, rows)
     print(f"{time.monotonic() - begin:.0f} s", file=sys.stderr)
     return 0

@@ -8,7 +8,6 @@ those that every arm has. With `--than ARM` the arms are those that have all its
 
 import argparse
 import statistics
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,6 +49,7 @@ _HALVES = {
     "domains that settings were chosen on": _CHOSEN,
     "the other domains": tuple(x for x in NAMES if x not in _CHOSEN),
 }
+_FIGURES = (".png", ".svg", ".pdf")
 Results = dict[str, dict[str, dict[str, Any]]]  # arm -> domain/task -> numbers
 
 
@@ -73,11 +73,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--than", metavar="ARM", help=words)
     args = parser.parse_args(argv)
     try:
+        if args.figure is not None and args.figure.suffix not in _FIGURES:
+            valid = f"it must end in {', '.join(_FIGURES)}"
+            raise UsageError(f"--figure {args.figure} is not valid; {valid}.")
         found: Results = {}
         variant = args.explored, args.tag
-        for i, path in enumerate(args.runs):
+        for path, name in zip(args.runs, names(args.runs), strict=True):
             own = read(path) if path.is_file() else results(path, *variant)
-            found |= {f"{arm}, {path.stem}" if i else arm: x for arm, x in own.items()}
+            found |= {arm + name: x for arm, x in own.items()}
         others = peers.read(args.peers)
         if args.than is not None and args.than not in found:
             raise UsageError(f"--than {args.than}: it is none of {', '.join(found)}.")
@@ -101,6 +104,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def names(paths: Sequence[Path]) -> list[str]:
+    """Returns what is added to the arms of folders and files, to the first's nothing.
+
+    That is the name of each, or its path where another one has that name.
+
+    Raises:
+      UsageError: if one is there twice.
+    """
+    own = [path.stem if path.is_file() else path.resolve().name for path in paths]
+    pairs = list(zip(paths, own, strict=True))[1:]
+    added = [str(path) if own[1:].count(x) > 1 else x for path, x in pairs]
+    if len(set(added)) < len(added):
+        raise UsageError("the same folder or file is given twice; give each once.")
+    return ["", *(f", {name}" for name in added)]
+
+
 def results(runs: Path, explored: int | None, tag: str) -> Results:
     """Returns the mean, the interval and each seed's mean, by arm and task.
 
@@ -110,7 +129,7 @@ def results(runs: Path, explored: int | None, tag: str) -> Results:
       tag: of the variant of phase 2; empty for the one without.
 
     Raises:
-      RunError: if a log cannot be read, or there is none.
+      RunError: if a log cannot be read, or none has such a task.
     """
     rows = [row for row in logs.load(runs) if row.tag == tag]
     if explored is None:
@@ -126,6 +145,10 @@ def results(runs: Path, explored: int | None, tag: str) -> Results:
                 if task in scores:
                     own_numbers = numbers(scores[task], steps)
                     found.setdefault(arm, {})[_name(domain, task)] = own_numbers
+    if not found:
+        which = f" as variant {tag}" * bool(tag)
+        which += f" after {explored} trials" * bool(explored)
+        raise UsageError(f"no run in {runs} has performed tasks of the suite{which}.")
     return found
 
 
@@ -256,4 +279,4 @@ def _of_seeds(own: Sequence[Mapping[str, Any]]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signals.as_program(main)

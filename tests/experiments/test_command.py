@@ -68,6 +68,7 @@ def test_a_command_is_named_as_it_was_called(called, monkeypatch):
     run = ("run", "zero-shot", "--from", Path("runs/a"))
     assert calling.line(*run) == "jaxpets zero-shot --from runs/a"
     assert calling.line("status") == "jaxpets status"
+    assert calling.line("status", Path("my runs")) == "jaxpets status 'my runs'"
     monkeypatch.setattr(sys, "argv", ["experiments/run.py"])
     assert calling.line(*run) == ("python -m experiments.run zero-shot --from runs/a")
     assert calling.usage("status") == "experiments.status"

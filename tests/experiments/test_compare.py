@@ -88,3 +88,12 @@ def test_what_cannot_be_compared_is_one_line(tmp_path, capsys, names, words):
     code, out = said(capsys, *(tmp_path / name for name in names))
     assert code == 2 and words in out.err and out.err.count("\n") == 1
     assert not Path("runs/compare").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys):
+    run(tmp_path, "a", (1.0,))
+    run(tmp_path, "b", (1.0,))
+    (tmp_path / "file").touch()
+    words = (tmp_path / "a", tmp_path / "b", "--out", tmp_path / "file" / "x")
+    code, out = said(capsys, *words)
+    assert code == 5 and out.err.startswith("error: cannot make ")

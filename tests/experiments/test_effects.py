@@ -100,6 +100,17 @@ def test_arms_of_a_second_folder_are_named_after_it(runs, ceilings, tmp_path, ca
     assert "| `best, more` | - | 0.50 [0.50, 0.50] | - |" in papers
 
 
+def test_arms_of_folders_of_one_name_are_not_one_arm(runs, ceilings, tmp_path, capsys):
+    a, b = tmp_path / "a" / "more", tmp_path / "b" / "more"
+    performed(a, "best", "icem", {"forward": [50], "jump": [20]})
+    performed(b, "best", "icem", {"forward": [10], "jump": [20]})
+    flags = [str(a), str(b), "--ceilings", str(ceilings)]
+    assert effects.main([str(runs), *flags]) == 0
+    papers = sections(capsys.readouterr().out)["the paper's tasks"]
+    assert f"| `best, {a}` | - | 0.50 [0.50, 0.50] | - |" in papers
+    assert f"| `best, {b}` | - | 0.10 [0.10, 0.10] | - |" in papers
+
+
 def test_variants_are_compared_where_one_thing_differs(runs, ceilings, capsys):
     assert effects.main([str(runs), "--ceilings", str(ceilings)]) == 0
     pairs = sections(capsys.readouterr().out)["one variant less another, %"]

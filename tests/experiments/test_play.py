@@ -647,6 +647,13 @@ def test_what_is_wrong_is_a_line(capsys, tmp_path):
     assert (code, f"--port {port}" in line) == (2, True)
 
 
+def test_a_port_that_there_is_not_is_refused():
+    """The system's look-up of an address takes what is left of it after 65536."""
+    options = serve.Options("pretrained/best", port=65_536)
+    with pytest.raises(UsageError, match="--port 65536 is not to be had"):
+        serve._opened(options)
+
+
 def test_a_signal_ends_it_at_once():
     process = runs.start("-u", "-m", "experiments.play", "--port", "0")
     assert process.stdout.readline().startswith("open http://localhost:")

@@ -50,6 +50,15 @@ def test_a_run_without_what_is_asked_is_an_error(explored, tmp_path, capsys):
     assert f"cannot write {tmp_path / 'file'}" in capsys.readouterr().err
 
 
+def test_the_card_never_takes_the_place_of_the_model(explored, tmp_path, capsys):
+    assert share.main([str(explored), str(tmp_path / "m.md")]) == 2
+    assert "m.md is where the card goes" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "n.md").mkdir()
+    assert share.main([str(explored), str(tmp_path / "n.safetensors")]) == 5
+    assert f"cannot write {tmp_path / 'n.md'}" in capsys.readouterr().err
+
+
 def test_a_file_that_only_a_run_speaks_of_does_not_run(explored, tmp_path, capsys):
     """The run may be a stranger's."""
     run, file = tmp_path / "run", tmp_path / "robot.py"

@@ -130,9 +130,12 @@ def test_before_there_is_a_run_nothing_can_swallow_ctrl_c():
     assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGINT, "", "")
 
 
-def test_a_reader_who_has_seen_enough_is_no_bug():
+@pytest.mark.parametrize(
+    "words", ["experiments explore --help", "experiments.status tests"]
+)
+def test_a_reader_who_has_seen_enough_is_no_bug(words):
     """As in `... --help | head`; the exit code is that of a program in C."""
-    argv = [sys.executable, "-m", "experiments", "explore", "--help"]
+    argv = [sys.executable, "-m", *words.split()]
     reader, writer = os.pipe()
     os.close(reader)
     found = subprocess.run(

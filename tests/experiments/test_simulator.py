@@ -1,6 +1,7 @@
 """Performing with the simulator as the model: what a search can reach."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,28 @@ def test_it_searches_as_the_shipped_models_do():
 def test_a_task_that_there_is_not_is_refused(capsys):
     assert simulator.main(["--task", "forward,swim"]) == 2
     assert "--task forward,swim is not valid; it must be all" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("--num-trials", "0"), 2, "--num-trials 0 is not valid; it must be 1 to"),
+        (("--trial-length", "-3"), 2, "--trial-length -3 is not valid"),
+        (("--task-planner.horizon", "0"), 2, "--task-planner.horizon 0 is not valid"),
+        (("--task-planner.num-elites", "999"), 2, "--task-planner.num-elites 999"),
+        (("--json", "file/rows.jsonl"), 5, "cannot write file/rows.jsonl"),
+        (("--json", "folder"), 5, "folder is a link, or no file"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_it_performs(
+    words, code, said, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(simulator, "perform", None)
+    Path("file").touch()
+    Path("folder").mkdir()
+    assert simulator.main(words) == code
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow

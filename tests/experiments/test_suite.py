@@ -159,6 +159,24 @@ def test_arms_of_more_folders_are_named_after_them(runs, tmp_path, peers, capsys
     assert "| cheetah/run | 600 [-671, 1871] | 1 [1, 1] |" in capsys.readouterr().out
 
 
+def test_folders_of_one_name_are_told_apart_by_their_paths(
+    runs, tmp_path, peers, capsys, monkeypatch
+):
+    """What two folders have is never shown as one of them, nor left out."""
+    monkeypatch.chdir(tmp_path)
+    for folder, value in (("a", 1), ("b", 900)):
+        performed(Path(folder, "more.v2"), "dmc/cheetah", {"run": [value] * 2})
+    assert suite.main([str(runs), "a/more.v2", "b/more.v2", "--peers", peers]) == 0
+    text = capsys.readouterr().out
+    assert "| task | `best` | `best, a/more.v2` | `best, b/more.v2` |" in text
+    assert "| cheetah/run | 600 [-671, 1871] | 1 [1, 1] | 900 [900, 900] |" in text
+    monkeypatch.chdir("a/more.v2")
+    assert suite.main([str(runs), ".", "--peers", peers]) == 0
+    assert "| `best` | `best, more.v2` |" in capsys.readouterr().out
+    assert suite.main([str(runs), ".", ".", "--peers", peers]) == 2
+    assert "given twice" in capsys.readouterr().err
+
+
 def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
     assert suite.main([str(tmp_path / "none"), "--peers", peers]) == 2
     assert "there is no metrics.jsonl" in capsys.readouterr().err
@@ -166,6 +184,18 @@ def test_what_cannot_be_read_is_said(runs, tmp_path, peers, capsys):
     path.write_text("{}")
     assert suite.main([str(runs), "--explored", "4", "--peers", peers]) == 2
     assert f"{path} has no numbers of others" in capsys.readouterr().err
+
+
+def test_a_file_of_results_is_not_replaced_by_nothing(runs, tmp_path, peers, capsys):
+    path = tmp_path / "suite.json"
+    path.write_text("kept")
+    flags = ["--peers", peers, "--json", str(path)]
+    for other in (["--tag", "acter"], ["--explored", "5"], ["--figure", "x.xyz"]):
+        assert suite.main([str(runs), *flags, *other]) == 2
+    said = capsys.readouterr().err
+    assert "has performed tasks of the suite as variant acter." in said
+    assert "after 5 trials." in said and "must end in .png, .svg" in said
+    assert path.read_text() == "kept"
 
 
 def test_the_committed_numbers_of_others_are_of_every_task():

@@ -204,6 +204,11 @@ def test_the_files_of_tables_are_valid(name, monkeypatch):
         (FILE.replace("num-trials = 1", "num-trials = 0"), "--num-trials 0"),
         (FILE.replace("num-trials", "num-trails"), "Perhaps --num-trials?"),
         (FILE.replace("pink-noise", "random"), "two of its runs have one name"),
+        (
+            FILE.replace("num-trials = 1", 'out = "x"'),
+            "out = 'x' is not valid as a flag",
+        ),
+        (FILE + '[[then]]\nphase = "zero-shot"\nname = "x"', "name = 'x' is not valid"),
         (FILE.replace('["random', '["../x/.py'), "--arm"),
         (FILE + '[[then]]\nphase = "explore"', "then.phase 'explore'"),
         (FILE + '[[then]]\nphase = "zero-shot"\neval-trials = 0', "--eval-trials 0"),
