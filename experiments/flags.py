@@ -118,7 +118,7 @@ def of(
         registry=_AS_WRITTEN,
         prog=calling.usage("run", command),
     )
-    return read(role, _given(found), default, _refuse), rest
+    return read(role, _given(found), default, refuse), rest
 
 
 def _without_unread(default: T, phase: str) -> T:
@@ -198,7 +198,7 @@ def beside(rest: Sequence[str], default: Config, command: str) -> Config:
         if command != "report" and entry.of(found) != entry.of(default):
             phases = [name for name, role in COMMANDS.items() if entry in entries(role)]
             wanted = f"left out in {command}; it is for {' and '.join(phases)}"
-            raise _refuse(entry.name, entry.of(found), wanted)
+            raise refuse(entry.name, entry.of(found), wanted)
     return found
 
 
@@ -263,7 +263,8 @@ def _value(hint: Any, word: str) -> Any:
     return word
 
 
-def _refuse(name: str, value: Any, wanted: str | None) -> UsageError:
+def refuse(name: str, value: Any, wanted: str | None) -> UsageError:
+    """Returns the error for a flag's value, of one or of several words."""
     shown = value
     if isinstance(value, list):
         shown = " ".join(map(str, value)) or "with no value"

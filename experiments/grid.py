@@ -55,15 +55,18 @@ def read(path: Path) -> Sweep:
       UsageError: naming the file, and what in it is not valid.
     """
     said = _load(path)
-    if (base := said.pop("base", None)) is not None:
-        below = path.parent / str(base)
-        under = msgspec.to_builtins(
-            _sweep(below, _load(below))
-        )  # it has no base itself
-        own = _sweep(path, {"out": "", "grid": {}} | said)
-        flags = _flat(under["flags"]) | _flat(own.flags)
-        said = under | said | {"grid": under["grid"] | own.grid, "flags": flags}
-    return _sweep(path, said)
+    base = said.pop("base", None)
+    if base is None:
+        return _sweep(path, said)
+    below = path.parent / str(base)
+    under = _sweep(below, _load(below))  # which has no base itself
+    own = _sweep(path, {"out": under.out, "grid": {}} | said)
+    unsaid = {x: getattr(under, x) for x in own.__struct_fields__ if x not in said}
+    both = {
+        "grid": under.grid | own.grid,
+        "flags": _flat(under.flags) | _flat(own.flags),
+    }
+    return msgspec.structs.replace(own, **unsaid | both)
 
 
 def _load(path: Path) -> dict[str, Any]:

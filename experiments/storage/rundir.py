@@ -178,6 +178,19 @@ def read_json(path: Path, limit: int = _MAX_JSON_BYTES) -> Any:
     raise CheckpointError(f"{path} cannot be read ({why}). Restore or remove it.")
 
 
+def read_as(path: Path, form: Any, what: str) -> Any:
+    """Reads a file of JSON in a form, such as a type of msgspec.
+
+    Raises:
+      CheckpointError: as `read_json`.
+      UsageError: if it is not in that form, which has `what`.
+    """
+    try:
+        return msgspec.convert(read_json(path), form)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{path} has no {what}: {error}") from error
+
+
 def find_json(path: Path) -> dict[str, Any]:
     """Returns the object in a file, or an empty one if there is none to read."""
     try:

@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         rows = [
             row._replace(arm=row.arm + name)
-            for folder, name in zip(args.runs, suite.names(args.runs), strict=True)
+            for folder, name in zip(args.runs, suite.suffixes(args.runs), strict=True)
             for row in logs.load(folder)
             if row.explored == args.explored
         ]

@@ -1,11 +1,9 @@
 """What others have published of the suite's tasks: `results/dmc20-peers.json`."""
 
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from ..errors import UsageError
 from ..storage import rundir
 
 FILE = Path("results/dmc20-peers.json")
@@ -35,19 +33,7 @@ def read(path: Path) -> Peers:
     Raises:
       RunError: if it is not there, or is not one.
     """
-    return read_as(path, Peers, "numbers of others")
-
-
-def read_as(path: Path, form: Any, what: str) -> Any:
-    """Reads a file of JSON that has `what`, in a form.
-
-    Raises:
-      RunError: if it is not there, or is not one.
-    """
-    try:
-        return msgspec.convert(rundir.read_json(path), form)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{path} has no {what}: {error}") from error
+    return rundir.read_as(path, Peers, "numbers of others")
 
 
 def label(system: System, i: int) -> str:

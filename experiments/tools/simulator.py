@@ -19,11 +19,11 @@ import tyro
 import jaxpets
 from jaxpets.envs import Robot, Tasks, env_rollout, with_constants
 
-from .. import acting, robots
+from .. import acting, flags, robots
 from ..build import imagined_end, optimizer
 from ..config import EngineName, PlannerConfig, Steps, TaskTrials
-from ..entries import flag, read, to_json
-from ..errors import RunError, UsageError
+from ..entries import read, to_json
+from ..errors import RunError
 from ..presets import PRESETS, quick_search
 from ..storage import metrics, rundir
 from ..storage.environment import environment
@@ -95,15 +95,11 @@ def _chosen(args: Arguments, robot: Robot) -> Tasks:
     return robots.chosen(dataclasses.replace(_PAPER, task=args.task), robot)
 
 
-def _refused(name: str, value: Any, wanted: str | None) -> UsageError:
-    return UsageError(f"{flag(name)} {value} is not valid; it must be {wanted}.")
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Performs, and prints a line per task; returns the exit code."""
     args = tyro.cli(Arguments, args=argv, prog=f"{__package__}.simulator")
     try:
-        read(Arguments, to_json(args), args, _refused)
+        read(Arguments, to_json(args), args, flags.refuse)
         check_planner("--task-planner", args.task_planner, 1)
         if args.json is not None:
             metrics.append_rows(args.json, [])  # before anything is computed

@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UsageError(f"--figure {args.figure} is not valid; {valid}.")
         found: Results = {}
         variant = args.explored, args.tag
-        for path, name in zip(args.runs, names(args.runs), strict=True):
+        for path, name in zip(args.runs, suffixes(args.runs), strict=True):
             own = read(path) if path.is_file() else results(path, *variant)
             found |= {arm + name: x for arm, x in own.items()}
         others = peers.read(args.peers)
@@ -104,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def names(paths: Sequence[Path]) -> list[str]:
+def suffixes(paths: Sequence[Path]) -> list[str]:
     """Returns what is added to the arms of folders and files, to the first's nothing.
 
     That is the name of each, or its path where another one has that name.
@@ -212,7 +212,7 @@ def read(path: Path) -> Results:
     Raises:
       RunError: if it is not there, or is not one.
     """
-    return peers.read_as(path, Results, "results")
+    return rundir.read_as(path, Results, "results")
 
 
 def _trial_steps(config: Mapping[str, Any]) -> int:
