@@ -234,7 +234,7 @@ def test_committed_steps_are_those_of_the_committed_logs(tmp_path, capsys):
         logs.extractall(tmp_path, filter="data")
     path = results / "dmc20" / "steps.json"
     found = {"best": json.loads((results / "dmc20.json").read_text())["best"]}
-    for name in ("dmc20-50k", "dmc20-200k"):
+    for name in ("dmc20-50k", "dmc20-200k", "dmc20-500k"):
         found[f"best, {name}"] = suite.results(tmp_path / name, None, "")["best"]
     assert found == json.loads(path.read_text())
     flags = ["--peers", str(PEERS_FILE), "--than", "best, dmc20-50k"]
@@ -250,6 +250,8 @@ def test_committed_steps_are_those_of_the_committed_logs(tmp_path, capsys):
     assert f"**Half of the steps lose {gains['**mean** (of 20)']}.**" in page
     for task in ("quadruped/walk", "quadruped/run", "cheetah/run", "walker/run"):
         assert f"`{task}` by {gains[task]}" in page
+    for task, scores in found["best, dmc20-500k"].items():
+        assert f"`{task.partition('/')[2]}` {suite.cell(scores)}" in page
 
 
 @pytest.mark.parametrize("arm", OTHERS)
