@@ -233,7 +233,7 @@ class Exploration(Basics):
     """Environment steps per exploration trial."""
     num_bits: Annotated[int, Meta(ge=1, le=32), EXPLORED, COUNTED] = 32
     """count: bits of the hash."""
-    milestones: Annotated[tuple[int, ...], COUNTED] = (10, 20, 26, 40)
+    milestones: Annotated[tuple[Trials, ...], COUNTED] = (10, 20, 26, 40)
     """Trials whose checkpoints are kept for good; otherwise the last two are."""
     model: ModelConfig = ModelConfig()
     training: TrainingConfig = TrainingConfig()

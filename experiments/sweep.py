@@ -109,6 +109,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         sweep = grid.read(args.file)
         jobs = [job for job in _named(sweep) if args.only in job.name]
+        if not jobs:
+            raise UsageError(f"--only {args.only} is not valid; no run is called so.")
         if args.run is not None:
             return _run(jobs, args.run)
         with robots.without_gl():

@@ -199,6 +199,8 @@ def write(out: Path, measure_fn: Callable[[], dict]) -> int:
     try:
         if not out.parent.is_dir():
             raise UsageError(f"--out {out} is not valid; there is no such folder.")
+        if out.is_dir():
+            raise UsageError(f"--out {out} is not valid; it is a folder.")
         rundir.write_json(out, measure_fn())
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -69,6 +69,7 @@ explore --preset paper                  | --preset paper; hours; --allow-cpu
 --num-trials 1e9                        | --num-trials 1e9; 1 to 100,000
 --num-trials 2.5                        | --num-trials 2.5; 1 to 100,000
 --num-trials nan                        | --num-trials nan; 1 to 100,000
+--milestones 10 -1                      | --milestones 10 -1; a list, each 1 to 100,000
 --training.learning-rate nan            | learning-rate nan; 1e-09 to 1.0
 --model.state-margin inf                | state-margin inf; 0.0 to 1,000,000.0 or None
 --tuning.num-epochs 0                   | --tuning.num-epochs 0; 1 to 10,000

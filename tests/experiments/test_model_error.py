@@ -275,6 +275,7 @@ def test_an_earlier_trial(explored):
         (("--rows", "0"), 2, "error: --rows 0 is not valid; it must be 1 or more."),
         (("--at-trial", "1"), 3, "error: no checkpoint 1 in "),
         (("--out", "none/a.json"), 2, "error: --out none/a.json is not valid; "),
+        (("--out", "."), 2, "error: --out . is not valid; it is a folder."),
     ],
 )
 def test_flags_that_cannot_work(explored, tmp_path, capsys, flags, code, words):

@@ -241,6 +241,12 @@ def test_a_run_that_fails_does_not_keep_the_others(file, tmp_path, capsys, monke
     assert capsys.readouterr().out == "1 runs, 1 of them complete\n"
 
 
+def test_a_name_that_no_run_has(file, capsys):
+    assert sweep.main([str(file(FILE)), "--only", "nope", "--list"]) == 2
+    said = capsys.readouterr()
+    assert "--only nope is not valid; no run is called so." in said.out + said.err
+
+
 def test_a_run_has_its_phases_in_turn(file, monkeypatch, capsys):
     calls = []
     monkeypatch.setattr(sweep.run, "main", lambda argv: calls.append(argv[0]) or 4)
