@@ -22,7 +22,7 @@ from jaxpets._src.coordinates import space
 from jaxpets._src.types import Env, EnvState
 from jaxpets.envs.engines import Engine, Physics, mjx_engine, native_engine
 from jaxpets.envs.extra import needs_extra
-from jaxpets.envs.observations import DEFAULT, Reading, readings
+from jaxpets.envs.observations import DEFAULT, Reading, actuators, readings
 from jaxpets.envs.trial_start import ResetFn, start_fn, unit_quaternions
 
 with needs_extra():
@@ -191,11 +191,10 @@ def _action_range(model: Any) -> tuple[Array, Array]:
 
 def _control_names(model: Any) -> list[str]:
     """Returns whose each control is: of MuJoCo 4 on one may have several, or none."""
-    count = len(model.actuator_trntype)
-    sizes = getattr(model, "actuator_ctrlnum", np.ones(count, np.int32))
+    names = actuators(model)
+    sizes = getattr(model, "actuator_ctrlnum", [1] * len(names))
     found: list[str] = []
-    for i, size in enumerate(sizes):
-        name = model.actuator(i).name or f"actuator{i}"
+    for name, size in zip(names, sizes, strict=True):
         own = [f"control {k} of {name}" for k in range(size)]
         found += own if size > 1 else [name] * size
     return found

@@ -80,8 +80,9 @@ def readings(model: Any, observe: Sequence[str]) -> tuple[Reading, ...]:
         found += chosen
     if not found:
         raise ValueError(f"observe must name an entry of the model, got {observe!r}.")
+    clocks = _clocks(model)
     for reading in found:
-        if reading.source == "sensordata" and reading.place in _clocks(model):
+        if reading.source == "sensordata" and reading.place in clocks:
             name = reading.coordinate.name
             raise ValueError(
                 f"observe must be of a state, which has no time, but {name} is a clock."
@@ -135,7 +136,11 @@ def _groups(model: Any, shifts: set[int]) -> dict[str, list[Reading]]:
         "mean_qvel": mean,
         "qpos": qpos,
         "qvel": qvel,
-        "act": [r for i in _actuators(model) for r in _activations(model, i)],
+        "act": [
+            reading
+            for i, name in enumerate(actuators(model))
+            for reading in _activations(model, i, f"act/{name}")
+        ],
         "sensordata": [
             r for i in range(model.nsensor) for r in _sensor(model, i, shifts)
         ],
@@ -195,13 +200,12 @@ def _velocities(model: Any, joint: int) -> list[Reading]:
     ]
 
 
-def _actuators(model: Any) -> range:
-    """Returns their numbers; of MuJoCo 4 on, one may have several controls, or none."""
-    return range(len(model.actuator_trntype))
+def actuators(model: Any) -> list[str]:
+    """Returns their names; of MuJoCo 4 on, one may have several controls, or none."""
+    return [_name(model, "ACTUATOR", i) for i in range(len(model.actuator_trntype))]
 
 
-def _activations(model: Any, actuator: int) -> list[Reading]:
-    name = f"act/{_name(model, 'ACTUATOR', actuator)}"
+def _activations(model: Any, actuator: int, name: str) -> list[Reading]:
     start, size = (
         int(x[actuator]) for x in (model.actuator_actadr, model.actuator_actnum)
     )
