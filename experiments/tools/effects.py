@@ -23,7 +23,7 @@ from ..storage.metrics import Row, number
 from . import suite
 
 UPRIGHT = "upright"  # a task that measures
-_GROUPS = ("the paper's tasks", "other tasks")
+_GROUPS = ("known tasks", "other tasks")
 _AS_SET = "as the runs are set"
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]  # variant, arm, task
 Ceilings = dict[str, float]  # of a step, by task
@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--than", default="best", metavar="ARM", help="the others are compared with it"
     )
+    words = "tasks that were known when settings were chosen; by default the paper's"
+    parser.add_argument("--known", metavar="TASKS", help=words)
     parser.add_argument("--json", type=Path, help="file for the results")
     args = parser.parse_args(argv)
     try:
@@ -62,13 +64,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             if row.explored == args.explored
         ]
         found = results(rows, ceilings(args.ceilings))
+        known = _known(args.known, found)
         if args.json is not None:
             with storage_errors(f"write {args.json}"):
                 rundir.write_json(args.json, found)
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
-    print("\n".join(report(found, args.than)))
+    print("\n".join(report(found, args.than, known)))
     return 0
 
 
@@ -121,18 +124,34 @@ def results(rows: Iterable[Row], ceiling: Ceilings) -> Results:
     return found
 
 
-def report(found: Results, than: str) -> list[str]:
+def _known(text: str | None, found: Results) -> Sequence[str]:
+    if text is None:
+        return tables.TASKS
+    performed = {x: None for arms in found.values() for y in arms.values() for x in y}
+    chosen = text.split(",")
+    for task in chosen:
+        if task not in performed:
+            valid = f"{task!r} is none of {', '.join(performed)}"
+            raise UsageError(f"--known {text} is not valid; {valid}.")
+    return chosen
+
+
+def report(found: Results, than: str, known: Sequence[str] = tables.TASKS) -> list[str]:
     """Returns the tables: scores by arm and variant, differences, and every task.
 
     Args:
       found: as `results` has it.
       than: the arm that the others are compared with.
+      known: tasks that are shown apart from the others.
     """
     arms = tables.in_order({arm for by_arm in found.values() for arm in by_arm})
     lines: list[str] = []
-    for group in _GROUPS:
+    for group, chosen in zip(_GROUPS, (True, False), strict=True):
         scores = {
-            tag: {arm: _by_seed(x, group) for arm, x in by_arm.items()}
+            tag: {
+                arm: _by_seed({y: x[y] for y in x if (y in known) is chosen})
+                for arm, x in by_arm.items()
+            }
             for tag, by_arm in found.items()
         }
         lines += [f"## {group}", "", *_by_variant(scores, arms, _iqm)]
@@ -206,22 +225,12 @@ def _mean(values: Iterable[float | None]) -> str:
     return f"{np.mean(known):.2f}" if known else "-"
 
 
-def _by_seed(
-    by_task: Mapping[str, Mapping[str, Any]], group: str | None = None
-) -> dict[str, list[float]]:
-    """Returns the scores of a group's tasks by seed, of seeds that performed all."""
-    chosen = [
-        x
-        for name, x in by_task.items()
-        if name != UPRIGHT and group in (None, _group(name))
-    ]
+def _by_seed(by_task: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float]]:
+    """Returns the scores of tasks by seed, of seeds that performed all."""
+    chosen = [x for name, x in by_task.items() if name != UPRIGHT]
     seeds = set.intersection(*(set(x["score"]) for x in chosen)) if chosen else set()
     every = {seed: [x["score"][seed] for x in chosen] for seed in sorted(seeds)}
     return {seed: scores for seed, scores in every.items() if np.isfinite(scores).all()}
-
-
-def _group(task: str) -> str:
-    return _GROUPS[task not in tables.TASKS]
 
 
 def _iqm(by_seed: Mapping[str, Sequence[float]]) -> str:

@@ -66,7 +66,7 @@ def test_a_score_is_a_share_of_what_the_simulator_reaches(runs, ceilings, tmp_pa
 def test_scores_are_shown_by_arm_and_variant(runs, ceilings, capsys):
     assert effects.main([str(runs), "--ceilings", str(ceilings)]) == 0
     shown = sections(capsys.readouterr().out)
-    papers, others = shown["the paper's tasks"], shown["other tasks"]
+    papers, others = shown["known tasks"], shown["other tasks"]
     assert papers[0] == "| arm | cem | icem | refit-icem |"
     # IQM of what two seeds have of 5 and 2 a step.
     best = "0.30 [0.20, 0.40] | 0.50 [0.40, 0.60] | 0.80 [0.80, 0.80]"
@@ -85,18 +85,30 @@ def test_arms_are_compared_with_one_of_them(runs, ceilings, capsys):
         return sections(capsys.readouterr().out)
 
     # 10 and 30 % less 40 and 60 %: Welch's interval of four numbers.
-    less = shown()["the paper's tasks, less `best`, %"]
+    less = shown()["known tasks, less `best`, %"]
     assert "| `random` | - | -30.0 [-90.8, 30.8] | - |" in less
     assert not any("`best`" in line for line in less)
-    less = shown("--than", "random")["the paper's tasks, less `random`, %"]
+    less = shown("--than", "random")["known tasks, less `random`, %"]
     assert "| `best` | - | 30.0 [-30.8, 90.8] | - |" in less
+
+
+def test_which_tasks_were_known_can_be_said(runs, ceilings, capsys):
+    flags = [str(runs), "--ceilings", str(ceilings), "--known"]
+    assert effects.main([*flags, "jump"]) == 0
+    shown = sections(capsys.readouterr().out)
+    best = "0.25 [0.25, 0.25] | 0.50 [0.50, 0.50] | 1.00 [0.75, 1.25]"
+    assert f"| `best` | {best} |" in shown["known tasks"]
+    assert "| `random` | - | 0.20 [0.10, 0.30] | - |" in shown["other tasks"]
+    assert effects.main([*flags, "jump,jum"]) == 2
+    expected = "--known jump,jum is not valid; 'jum' is none of forward, jump."
+    assert expected in capsys.readouterr().err
 
 
 def test_arms_of_a_second_folder_are_named_after_it(runs, ceilings, tmp_path, capsys):
     performed(tmp_path / "more", "best", "icem", {"forward": [50], "jump": [20]})
     flags = [str(tmp_path / "more"), "--ceilings", str(ceilings)]
     assert effects.main([str(runs), *flags]) == 0
-    papers = sections(capsys.readouterr().out)["the paper's tasks"]
+    papers = sections(capsys.readouterr().out)["known tasks"]
     assert "| `best, more` | - | 0.50 [0.50, 0.50] | - |" in papers
 
 
@@ -106,7 +118,7 @@ def test_arms_of_folders_of_one_name_are_not_one_arm(runs, ceilings, tmp_path, c
     performed(b, "best", "icem", {"forward": [10], "jump": [20]})
     flags = [str(a), str(b), "--ceilings", str(ceilings)]
     assert effects.main([str(runs), *flags]) == 0
-    papers = sections(capsys.readouterr().out)["the paper's tasks"]
+    papers = sections(capsys.readouterr().out)["known tasks"]
     assert f"| `best, {a}` | - | 0.50 [0.50, 0.50] | - |" in papers
     assert f"| `best, {b}` | - | 0.10 [0.10, 0.10] | - |" in papers
 
@@ -197,7 +209,7 @@ def test_the_page_has_what_the_margin_brings(tmp_path, capsys):
     at = variants.index("refit-icem")
     held_out, papers = (
         shown[f"{group}, less `best`, %"][-1].strip("| ").split(" | ")
-        for group in ("other tasks", "the paper's tasks")
+        for group in ("other tasks", "known tasks")
     )
     assert held_out[0] == "`best, study-margin`" and held_out[at] == "-0.2 [-3.2, 2.8]"
     assert papers[at] == "1.1 [-4.1, 6.3]"
@@ -208,7 +220,7 @@ def test_the_page_has_what_the_margin_brings(tmp_path, capsys):
 
 
 _NOT_ON_THE_PAGE = (
-    "the paper's tasks, less `best`, %",
+    "known tasks, less `best`, %",
     "other tasks, less `best`, %",
     "share of upright steps, and return over the value of the plans",
 )
