@@ -10,6 +10,9 @@ become rows:
     ncu --import seen.ncu-rep --page source --csv > source.csv
     python -m benchmarks.counters --read seen.csv --source source.csv
 
+The last of its runs is profiled. Pages are read where they were measured: a row names
+the machine and the versions of the program that makes it, and of the page its GPU.
+
 `used` is the share of all multiprocessors' time in which they had work. Of that time
 `tensor` is the share of tensor cores, `special` of the units for tanh and logarithms,
 and `issued` of schedulers that had an instruction to issue, with `warps` each. `waits`
@@ -33,8 +36,9 @@ COLUMNS = (
     "kernel", "engine", "seeds", "us", "blocks", "used", "tensor", "special", "issued",
     "warps", "registers", "spills",
 )  # fmt: skip
-_RUNS = 3
-_LARGEST = 8
+_RUNS = 3  # as many launches as ncu is told to skip, and one more
+_ROWS = 1000  # of the data of a fit
+_LARGEST = 20
 _US = {"ns": 1e-3, "us": 1.0, "ms": 1e3, "s": 1e6}
 _WAIT = "smsp__average_warps_issue_stalled_"
 _PER_ISSUE = "_per_issue_active.ratio"
@@ -45,8 +49,8 @@ def run(kernel: str, size: workloads.Size, engine: str, seeds: int) -> None:
     """Runs a kernel as often as the profiler wants."""
     keys = jax.random.split(jax.random.key(0), seeds)
     if kernel == "fit":
-        fitter = workloads.fitter(size, 1, engine="kernel")
-        params, state, data = workloads.prepare_fit(size, fitter, keys, 1000, 1000)
+        fitter = workloads.fitter(size, 1, 32, "kernel")
+        params, state, data = workloads.prepare_fit(size, fitter, keys, _ROWS, _ROWS)
         inputs: Any = (params, keys, state, data)
         step = jax.jit(workloads.fit_seeds(fitter))
     else:
@@ -103,7 +107,7 @@ def counters(page: Iterable[str]) -> dict[str, Any]:
         "special": number("sm__inst_executed_pipe_xu" + of_active) / 100,
         "issued": number("smsp__issue_active" + of_active) / 100,
         "warps": number("smsp__warps_active.avg.per_cycle_active"),
-        "waits": _shares(waits),
+        "waits": _shares(waits, but="selected"),  # it issues then
     }
 
 
@@ -122,14 +126,21 @@ def code(page: Iterable[str]) -> dict[str, float]:
     return _shares(samples)
 
 
-def _shares(parts: Counter[str]) -> dict[str, float]:
-    total = sum(parts.values())
-    return {x: round(y / total, 4) for x, y in parts.most_common(_LARGEST)}
+def _shares(parts: Counter[str], but: str = "") -> dict[str, float]:
+    """Returns the largest parts as shares of all."""
+    total = sum(parts.values()) or 1
+    largest = [(x, y) for x, y in parts.most_common() if x != but][:_LARGEST]
+    return {x: round(y / total, 4) for x, y in largest}
 
 
 def _row(args: argparse.Namespace, size: workloads.Size) -> Iterator[dict[str, Any]]:
-    sizes = {**dataclasses.asdict(size), "seeds": args.seeds, "engine": args.engine}
-    row = rows.make_row("counters", sizes, kernel=args.kernel)
+    own: dict[str, Any] = {"seeds": args.seeds, "engine": args.engine}
+    if args.kernel == "fit":
+        network = {"num_members": size.num_members, "hidden_sizes": size.hidden_sizes}
+        own |= {**network, "num_rows": _ROWS, "num_epochs": 1, "batch_size": 32}
+    else:
+        own |= {**dataclasses.asdict(size), "precision": "bf16"}
+    row = rows.make_row("counters", own, kernel=args.kernel)
     row |= counters(args.read.read_text().splitlines())
     if args.source:
         row["code"] = code(args.source.read_text().splitlines())
@@ -138,8 +149,11 @@ def _row(args: argparse.Namespace, size: workloads.Size) -> Iterator[dict[str, A
 
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Parses the flags, runs the kernel or reads what was seen of it."""
-    parser = rows.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, help="append the row to this file")
+    parser.add_argument("--tiny", action="store_true", help="a toy size")
     workloads.add_size_flag(parser)
     parser.add_argument("--kernel", choices=["rollout", "fit"], default="rollout")
     parser.add_argument("--engine", choices=["kernel", "sm_90"], default="kernel")
@@ -147,6 +161,10 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--read", type=Path, help="a page of raw numbers of one launch")
     parser.add_argument("--source", type=Path, help="its page of instructions")
     args = parser.parse_args(argv)
+    if args.kernel == "fit" and args.engine != "kernel":
+        parser.error("--engine is of rollouts: one kernel trains")
+    if not args.read and (args.json or args.source):
+        parser.error("--json and --source go with --read")
     size = workloads.chosen_size(args)
     if args.read:
         return rows.report(_row(args, size), COLUMNS, args.json)

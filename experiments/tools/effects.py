@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--than", default="best", metavar="ARM", help="the others are compared with it"
     )
-    words = "tasks that were known when settings were chosen; by default the paper's"
+    words = "known when settings were chosen, as walk,run; by default the paper's"
     parser.add_argument("--known", metavar="TASKS", help=words)
     parser.add_argument("--json", type=Path, help="file for the results")
     args = parser.parse_args(argv)
@@ -125,14 +125,13 @@ def results(rows: Iterable[Row], ceiling: Ceilings) -> Results:
 
 
 def _known(text: str | None, found: Results) -> Sequence[str]:
-    if text is None:
-        return tables.TASKS
-    performed = {x: None for arms in found.values() for y in arms.values() for x in y}
-    chosen = text.split(",")
-    for task in chosen:
-        if task not in performed:
-            valid = f"{task!r} is none of {', '.join(performed)}"
-            raise UsageError(f"--known {text} is not valid; {valid}.")
+    chosen = text.split(",") if text else tables.TASKS
+    performed = {
+        task for arms in found.values() for own in arms.values() for task in own
+    }
+    if text and not performed.issuperset(chosen):
+        valid = f"it must be some of {','.join(sorted(performed))}"
+        raise UsageError(f"--known {text} is not valid; {valid}.")
     return chosen
 
 

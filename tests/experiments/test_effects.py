@@ -100,7 +100,7 @@ def test_which_tasks_were_known_can_be_said(runs, ceilings, capsys):
     assert f"| `best` | {best} |" in shown["known tasks"]
     assert "| `random` | - | 0.20 [0.10, 0.30] | - |" in shown["other tasks"]
     assert effects.main([*flags, "jump,jum"]) == 2
-    expected = "--known jump,jum is not valid; 'jum' is none of forward, jump."
+    expected = "--known jump,jum is not valid; it must be some of forward,jump."
     assert expected in capsys.readouterr().err
 
 
