@@ -5,7 +5,6 @@ They are made of the files and of the committed logs.
 
 import contextlib
 import sys
-import tarfile
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 from jaxpets import models
 
 from ..storage import disk
+from ..storage.archive import unpack
 from . import card
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -42,10 +42,7 @@ def _logs(name: str) -> Iterator[list[Path]]:
     run = f"best-{name.replace('/', '-')}"
     with tempfile.TemporaryDirectory() as folder:
         for path in _SUITE:
-            with tarfile.open(RESULTS / path) as archive:
-                own = [x for x in archive if x.name.startswith(f"./{run}/")]
-                archive.extractall(folder, own, filter="data")
-            if own:
+            if unpack(RESULTS / path, Path(folder), f"./{run}/"):
                 break
         yield [*sorted(Path(folder, run).glob("zero-shot-*")), *laptop]
 

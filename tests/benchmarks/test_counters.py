@@ -1,12 +1,12 @@
 """What rows say of ncu's pages: those that are committed, and pages that are none."""
 
 import json
-import tarfile
 from pathlib import Path
 
 import pytest
 
 from benchmarks import counters
+from experiments.storage.archive import unpack
 
 RESULTS = Path(counters.__file__).parent / "results"
 SOURCE = """"Kernel Name","a_kernel"
@@ -22,8 +22,7 @@ COMMITTED = (RESULTS / "counters.jsonl").read_text().splitlines()
 
 
 def test_committed_rows_are_those_of_the_committed_pages(tmp_path, capsys):
-    with tarfile.open(RESULTS / "counters.tar.xz") as pages:
-        pages.extractall(tmp_path, filter="data")
+    unpack(RESULTS / "counters.tar.xz", tmp_path)
     seen = set()
     for row in map(json.loads, COMMITTED):
         engine, seeds = row["sizes"]["engine"], row["sizes"]["seeds"]
@@ -80,8 +79,7 @@ def test_samples_are_counted_by_kind_of_instruction():
 
 
 def test_the_page_of_instructions_joins_the_row(tmp_path):
-    with tarfile.open(RESULTS / "counters.tar.xz") as pages:
-        pages.extract("fit-1.csv", tmp_path, filter="data")
+    unpack(RESULTS / "counters.tar.xz", tmp_path, "fit-1.csv")
     (source := tmp_path / "source.csv").write_text(SOURCE)
     flags = ["--kernel", "fit", "--read", str(tmp_path / "fit-1.csv")]
     (row,) = counters.main([*flags, "--source", str(source)])

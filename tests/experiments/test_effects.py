@@ -2,7 +2,6 @@
 
 import json
 import runpy
-import tarfile
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import pytest
 from small_logs import write_run
 
 from experiments.report import stats
+from experiments.storage.archive import unpack
 from experiments.tools import effects
 from jaxpets.envs import half_cheetah as cheetah
 
@@ -168,8 +168,7 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
     study = root / "results" / "study"
     for path in study.glob("*.tar.xz"):
         if path.name not in ("stopped.tar.xz", "margin.tar.xz"):
-            with tarfile.open(path) as logs:
-                logs.extractall(tmp_path, filter="data")
+            unpack(path, tmp_path)
     found = tmp_path / "found.json"
     flags = ["--ceilings", str(study / "simulator.jsonl"), "--json", str(found)]
     assert effects.main([str(tmp_path), *flags]) == 0
@@ -200,8 +199,7 @@ def test_the_page_has_what_the_margin_brings(tmp_path, capsys):
     study = Path(__file__).parents[2] / "results" / "study"
     runs, margin = tmp_path / "runs", tmp_path / "study-margin"
     for name, folder in (("best", runs), ("margin", tmp_path)):
-        with tarfile.open(study / f"{name}.tar.xz") as logs:
-            logs.extractall(folder, filter="data")
+        unpack(study / f"{name}.tar.xz", folder)
     flags = ["--ceilings", str(study / "simulator.jsonl")]
     assert effects.main([str(runs), str(margin), *flags]) == 0
     shown = sections(capsys.readouterr().out)

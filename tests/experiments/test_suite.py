@@ -1,13 +1,13 @@
 """Twenty tasks of the suite beside others' numbers."""
 
 import json
-import tarfile
 from pathlib import Path
 
 import pytest
 from small_logs import write_run
 
 from experiments.storage import rundir
+from experiments.storage.archive import unpack
 from experiments.tools import peers as published
 from experiments.tools import suite
 
@@ -210,8 +210,7 @@ def test_the_committed_numbers_of_others_are_of_every_task():
 def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
     results = Path(__file__).parents[2] / "results"
     for arm in ("best", "epistemic", "random", *OTHERS):
-        with tarfile.open(results / "dmc20" / f"{arm}.tar.xz") as logs:
-            logs.extractall(tmp_path, filter="data")
+        unpack(results / "dmc20" / f"{arm}.tar.xz", tmp_path)
     found = suite.results(tmp_path, 100, "")
     assert found == json.loads((results / "dmc20.json").read_text())
     assert suite.main([str(results / "dmc20.json"), "--peers", str(PEERS_FILE)]) == 0
@@ -230,8 +229,7 @@ def test_committed_results_are_those_of_the_committed_logs(tmp_path, capsys):
 
 def test_committed_steps_are_those_of_the_committed_logs(tmp_path, capsys):
     results = Path(__file__).parents[2] / "results"
-    with tarfile.open(results / "dmc20" / "steps.tar.xz") as logs:
-        logs.extractall(tmp_path, filter="data")
+    unpack(results / "dmc20" / "steps.tar.xz", tmp_path)
     path = results / "dmc20" / "steps.json"
     found = {"best": json.loads((results / "dmc20.json").read_text())["best"]}
     for name in ("dmc20-50k", "dmc20-200k", "dmc20-500k"):
