@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from benchmarks import rows, workloads
 
@@ -59,7 +60,7 @@ def run(kernel: str, size: workloads.Size, engine: str, seeds: int) -> None:
         )
         # Each seed has a model of its own, as where seeds explore.
         params, obs, actions = jax.tree.map(
-            lambda x: jax.numpy.stack([x] * seeds), (params, obs, actions)
+            lambda x: jnp.stack([x] * seeds), (params, obs, actions)
         )
         inputs, step = (params, keys, obs, actions), jax.jit(jax.vmap(rollout))
     for _ in range(_RUNS):

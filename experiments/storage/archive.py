@@ -15,9 +15,12 @@ def unpack(path: Path, folder: Path, prefix: str = "") -> bool:
     Returns:
       Whether there is anything.
     """
+    found = False
     with tarfile.open(path) as archive:
-        wanted = [member for member in archive if member.name.startswith(prefix)]
         # Nothing outside of the folder; a Python before 3.11.4 knows of no filter.
         archive.extraction_filter = getattr(tarfile, "data_filter", None)
-        archive.extractall(folder, wanted)
-    return bool(wanted)
+        for member in archive:  # as they come: going back would decompress all again
+            if member.name.startswith(prefix):
+                archive.extract(member, folder)
+                found = True
+    return found

@@ -5,13 +5,14 @@ decision, and nothing at rest but for `stand` and `on-back`; its own two earn tw
 much, once for each control step, and half of that at rest on the feet.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxpets import envs
+from jaxpets import coordinates, envs
 from jaxpets.envs.tolerance import linear, tolerance
 from jaxpets.typing import RewardFn
 
@@ -21,7 +22,7 @@ _TALL = 0.7  # m, of 0.9 with all legs stretched; 0.2 is on the floor
 def tasks() -> Mapping[str, RewardFn]:
     """Returns the rewards by name."""
     robot = envs.make("dmc/quadruped")
-    place = [entry.name for entry in robot.env.coordinates].index
+    place = functools.partial(coordinates.index, robot.env.coordinates)
     x, y, height = (place(f"qpos/root.{name}") for name in ("qx", "qy", "z"))
     turn = place("qvel/root.wz")
     turns = jnp.array([place("qvel/root.wx"), place("qvel/root.wy"), turn])

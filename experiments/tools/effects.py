@@ -20,6 +20,7 @@ from ..errors import RunError, UsageError, last_line, storage_errors
 from ..report import logs, stats, tables
 from ..storage import rundir
 from ..storage.metrics import Row, number
+from ..validate import require
 from . import suite
 
 UPRIGHT = "upright"  # a task that measures
@@ -125,17 +126,16 @@ def results(rows: Iterable[Row], ceiling: Ceilings) -> Results:
 
 
 def _known(text: str | None, found: Results) -> Sequence[str]:
-    chosen = text.split(",") if text else tables.TASKS
-    performed = {
-        task for arms in found.values() for own in arms.values() for task in own
-    }
-    if text and not performed.issuperset(chosen):
-        valid = f"it must be some of {','.join(sorted(performed))}"
-        raise UsageError(f"--known {text} is not valid; {valid}.")
+    if text is None:
+        return tables.TASKS
+    performed = {x for arms in found.values() for own in arms.values() for x in own}
+    chosen = text.split(",")
+    valid = f"some of {','.join(sorted(performed))}"
+    require(performed.issuperset(chosen), "--known", text, valid)
     return chosen
 
 
-def report(found: Results, than: str, known: Sequence[str] = tables.TASKS) -> list[str]:
+def report(found: Results, than: str, known: Sequence[str]) -> list[str]:
     """Returns the tables: scores by arm and variant, differences, and every task.
 
     Args:

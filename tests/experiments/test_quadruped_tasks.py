@@ -1,5 +1,6 @@
 """What the study's tasks of the quadruped are worth, in states made by hand."""
 
+import functools
 import runpy
 from pathlib import Path
 
@@ -18,6 +19,11 @@ MOVES = {
 }
 
 
+@functools.cache
+def robot():
+    return envs.make("dmc/quadruped")
+
+
 @pytest.fixture(scope="module")
 def tasks():
     return runpy.run_path(str(FILE))["tasks"]()
@@ -25,9 +31,10 @@ def tasks():
 
 def earned(task, **entries):
     """Returns the reward of a step to a state, on the feet unless said otherwise."""
-    names = [entry.name for entry in envs.make("dmc/quadruped").env.coordinates]
     state = {"qpos/root.z": 0.8, "qpos/root.qw": 1.0, **entries}
-    obs = jnp.array([state.get(name, 0.0) for name in names], jnp.float32)
+    obs = jnp.array(
+        [state.get(entry.name, 0.0) for entry in robot().env.coordinates], jnp.float32
+    )
     return float(task((), obs, jnp.zeros(12), obs))
 
 
@@ -43,7 +50,7 @@ def test_who_moves_as_wanted_earns_all_and_who_rests_nothing(tasks, name):
 
 def test_its_own_tasks_are_those_of_the_robot(tasks):
     """Counted for each of two control steps; half of it for standing still."""
-    assert tuple(tasks)[:2] == envs.make("dmc/quadruped").tasks.names
+    assert tuple(tasks)[:2] == robot().tasks.names
     speed = "sensordata/velocimeter.x"
     assert earned(tasks["walk"], **{speed: 0.5}) == 2.0
     assert earned(tasks["run"], **{speed: 5.0}) == 2.0
