@@ -154,6 +154,8 @@ class ImaginationConfig:
     """Share of the critics that their slow copies take over in a gradient step."""
     pessimism: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """1: learn from the lesser of two critics; 0: from their mean."""
+    squash: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+    """Values are learned as logarithms, this often the largest; 0: as they are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,7 +184,7 @@ class DistillingConfig:
     """Of Adam, at first; it falls to a twentieth."""
     hidden_size: Annotated[int, Meta(ge=1, le=8192)] = DistillConfig.hidden_size
     """Width of the policy's two layers."""
-    critic: ImaginationConfig = ImaginationConfig(60_000, batch_size=1024, horizon=10)
+    critic: ImaginationConfig = ImaginationConfig(60_000, 1e-3, 1024, 10, squash=10.0)
     """How it is imagined."""
 
 
@@ -208,10 +210,8 @@ class Basics:
     epistemic: disagreement of the ensemble (SU-PETS);
     best: the same, in units of the data;
     one-step, plan2explore: disagreement about one step;
-    info-gain: the information that a step gives;
-    count: rare states; oracle: the first task;
-    mixture: the first task and disagreement;
-    random, pink-noise: nothing;
+    info-gain: the information that a step gives; random, pink-noise: nothing;
+    count: rare states; oracle: the first task; mixture: that and disagreement;
     jensen-renyi (MAX), opax, ensemble-std (CEE-US), rnd,
     particle-entropy (APT): what other methods seek;
     FILE.py:NAME: an objective of your own."""

@@ -23,6 +23,7 @@ LAYERS = {
     "_src.checks": 0,
     "_src.tensor_file": 0,
     "_src.moments": 1,
+    "_src.symlog": 1,
     "_src.elites": 1,
     "_src.guards": 0,
     "_src.returns": 1,

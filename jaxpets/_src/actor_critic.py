@@ -128,7 +128,9 @@ def actor_critic(
         largest = jnp.maximum(high, -low)
         scale = (1.0 - config.discount) / jnp.where(largest > 0.0, largest, 1.0)
         goal = goals_of(rewards).reshape(rows[0] * rows[1], -1)
-        found = networks.init(network_key, goal, dataset)._replace(scale=scale)
+        squash = jnp.asarray(config.squash, jnp.float32)
+        found = networks.init(network_key, goal, dataset)
+        found = found._replace(scale=scale, squash=squash)
         opt_state = optimizer.init(cast(Any, (found.actor, found.critics)))
         return ActorCriticState(
             found, found.critics, opt_state, obs, rewards, low, high

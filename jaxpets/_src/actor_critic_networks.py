@@ -12,6 +12,7 @@ from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
 from jaxpets._src.checks import check_callable, check_functions, check_record
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Head
+from jaxpets._src.symlog import symexp
 from jaxpets._src.types import (
     Dataset,
     ModelSpace,
@@ -29,10 +30,12 @@ class Networks(NamedTuple):
     """Functions of ActorCriticParams; `seen` is `[..., F + G]`, whitened.
 
     Attributes:
-      init: `(key, goal [R, G], Dataset) -> ActorCriticParams`, with scale 1.
+      init: `(key, goal [R, G], Dataset) -> ActorCriticParams`, with scale 1
+        and no squash.
       see: `(params, goal [..., G], obs [..., D]) -> seen`.
       propose: `(actor, seen) -> [..., A]`; its tanh is an action in half widths.
-      judge: `(critics, seen, action [..., A] in half widths) -> [2, ...]`, scaled.
+      judge: `(critics, seen, action [..., A] in half widths) -> [2, ...]`, scaled
+        and squashed.
       policy: see ActorCritic.
       value_fn: see ActorCritic.
     """
@@ -71,7 +74,9 @@ def build_networks(
         both = jnp.concatenate([mean, box.center])
         critics = jax.vmap(init_critic, (0, None))(jax.random.split(critic_key), both)
         one = jnp.ones((), jnp.float32)
-        return ActorCriticParams(actor.init(actor_key, mean), critics, mean, std, one)
+        return ActorCriticParams(
+            actor.init(actor_key, mean), critics, mean, std, one, jnp.zeros_like(one)
+        )
 
     def see(params: ActorCriticParams, goal: Array, obs: Array) -> Array:
         features = space.features(obs)
@@ -96,7 +101,8 @@ def build_networks(
         check_record("params.reward.networks", params, ActorCriticParams)
         seen = see(params, goals.features(data.reward), obs)
         action = jnp.tanh(propose(params.actor, seen))
-        value = jnp.mean(judge(params.critics, seen, action), axis=0) / params.scale
+        judged = symexp(judge(params.critics, seen, action), params.squash)
+        value = jnp.mean(judged, axis=0) / params.scale
         return box.center + box.half_width * action, value
 
     def step(

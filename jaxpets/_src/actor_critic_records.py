@@ -32,6 +32,9 @@ class ActorCriticConfig:
         them, so that what the actor leads to is learned as well as what was seen.
       target_rate: share of the critics that their slow copies take over in a step.
       pessimism: 1 learns from the lesser of two critics, 0 from their mean.
+      squash: with more than 0 critics learn `sign(v) log(1 + squash |v|)` of a value v
+        in units of the largest that rewards of the data allow. Some tasks of a family
+        earn far less than others; so their values still tell actions apart.
     """
 
     hidden_size: int = 256
@@ -44,13 +47,15 @@ class ActorCriticConfig:
     restart: float | Array = 0.02
     target_rate: float | Array = 0.02
     pessimism: float | Array = 0.0
+    squash: float | Array = 0.0
 
     def __post_init__(self) -> None:
         for name in ("hidden_size", "num_updates", "batch_size", "horizon"):
             check_count(name, getattr(self, name))
         for name in ("discount", "trace", "restart", "target_rate", "pessimism"):
             keep_checked(self, name, check_scalar, 0.0, 1.0)
-        keep_checked(self, "noise", check_scalar, 0.0)
+        for name in ("noise", "squash"):
+            keep_checked(self, name, check_scalar, 0.0)
         if not isinstance(self.discount, Tracer) and self.discount == 1.0:
             raise ValueError(f"discount must be below 1, got {self.discount}.")
 
@@ -78,6 +83,7 @@ class ActorCriticParams(NamedTuple):
       mean: `[F + G]`, of the features of observations and goals.
       std: `[F + G]`.
       scale: `[]`, what a value is multiplied by before the critics see it.
+      squash: `[]`, and how far it is squashed then; see ActorCriticConfig.
     """
 
     actor: Any
@@ -85,6 +91,7 @@ class ActorCriticParams(NamedTuple):
     mean: Array
     std: Array
     scale: Array
+    squash: Array
 
 
 class Guided(NamedTuple):

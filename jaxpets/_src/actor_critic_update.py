@@ -17,6 +17,7 @@ from jaxpets._src.actor_critic_records import (
 from jaxpets._src.guards import guarded_step
 from jaxpets._src.imagined_trials import Imagined
 from jaxpets._src.optimizer import Optimizer
+from jaxpets._src.symlog import symexp, symlog
 
 # Keeps the actor's outputs where its tanh has a slope.
 _ACTION_DECAY = 1e-4
@@ -43,14 +44,16 @@ def build_update(
         action = jnp.tanh(networks.propose(params.actor, seen))
         noise = jax.random.truncated_normal(key, -2.0, 2.0, action.shape, jnp.float32)
         action = jnp.clip(action + _SMOOTHING * noise, -1.0, 1.0)
-        first, second = networks.judge(state.targets, seen, action)
+        judged = networks.judge(state.targets, seen, action)
+        first, second = symexp(judged, params.squash)
         after = (first + second) / 2 - config.pessimism * jnp.abs(first - second) / 2
         returns = lambda_returns(
             params.scale * steps.reward, after, steps.goes_on, steps.counts,
             discount=config.discount, trace=config.trace,
         )  # fmt: skip
         bound = params.scale / (1.0 - config.discount)
-        return jnp.clip(returns, bound * state.low, bound * state.high)
+        returns = jnp.clip(returns, bound * state.low, bound * state.high)
+        return symlog(returns, params.squash)
 
     def loss(
         trained: tuple[Any, Any], params: ActorCriticParams, goal: Array,
@@ -62,11 +65,12 @@ def build_update(
         error = networks.judge(critics, seen, taken) - targets
         proposed = networks.propose(actor, seen)
         # The critics as they were: what the actor wants must not change them.
-        value = networks.judge(params.critics, seen, jnp.tanh(proposed)).mean(0)
+        judged = networks.judge(params.critics, seen, jnp.tanh(proposed))
         decay = _ACTION_DECAY * jnp.mean(proposed**2, axis=-1)
         weight = steps.counts.astype(jnp.float32)
         weight /= jnp.maximum(jnp.sum(weight), 1.0)
-        total = jnp.sum(error**2, axis=0) - value + decay
+        total = jnp.sum(error**2, axis=0) - judged.mean(0) + decay
+        value = symexp(judged, params.squash).mean(0)
         return jnp.sum(weight * total), jnp.sum(weight * value)
 
     def update(

@@ -12,6 +12,7 @@ from jaxpets._src.actor_critic_records import ActorCriticParams
 from jaxpets._src.distill_records import DistillState, Plans
 from jaxpets._src.guards import guarded_step
 from jaxpets._src.optimizer import Optimizer
+from jaxpets._src.symlog import symlog
 
 
 def keep(state: DistillState, plans: Plans) -> DistillState:
@@ -41,7 +42,8 @@ def build_update(
         own = jnp.tanh(networks.propose(actor, plans.seen))
         off = jnp.sum((own - plans.action) ** 2, axis=-1)
         value = networks.judge(critics, plans.seen, plans.action)
-        off += jnp.sum((value - params.scale * plans.value) ** 2, axis=0)
+        wanted = symlog(params.scale * plans.value, params.squash)
+        off += jnp.sum((value - wanted) ** 2, axis=0)
         weight = plans.counts / jnp.maximum(jnp.sum(plans.counts), 1.0)
         return jnp.sum(weight * off)
 

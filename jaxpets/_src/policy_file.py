@@ -115,11 +115,13 @@ def load_policy(
         file_facts.refuse(file, f"its first layer must be of two axes, got {first}")
     networks = build_networks(first[1], space, goals, box)
     template = _template(networks, space, facts["obs_size"], box, first[0])
-    wanted = {name: x.shape for name, x in tensor_file.named(template).items()}
-    file_facts.check_arrays(file, wanted)
-    arrays = file.arrays()
+    names = tensor_file.named(template)
+    # Files from before values were squashed do not say that theirs are not.
+    added = {"squash": np.zeros(())} if "squash" not in file.shapes else {}
+    file_facts.check_arrays(file, {n: names[n].shape for n in names if n not in added})
+    arrays = {**file.arrays(), **added}
     file_facts.check_no_nan(str(file.path), arrays)
-    leaves = [jnp.asarray(arrays[name], jnp.float32) for name in wanted]
+    leaves = [jnp.asarray(arrays[name], jnp.float32) for name in names]
     structure = cast(Any, jax.tree.structure(template))
     return networks.policy, cast(
         ActorCriticParams, jax.tree.unflatten(structure, leaves)

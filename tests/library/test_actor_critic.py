@@ -115,13 +115,15 @@ INIT, STEP = jax.jit(LEARNER.init), jax.jit(LEARNER.step)
 
 
 @functools.cache
-def learn(name, num_calls=1):
+def learn(name, num_calls=1, squash=0.0):
     """Every task is learned by the same compiled program."""
     data, task = states(), Task(*map(jnp.float32, TASKS[name]))
     limit = 1.0 if name == "broken world" else jnp.inf
     params = PlanParams((WORLD[0], jnp.float32(limit)), task)
     keys = jax.random.split(jax.random.key(0), num_calls + 1)
     before = INIT(params, keys[0], data)
+    squashed = before.params._replace(squash=jnp.float32(squash))
+    before = before._replace(params=squashed)
     if name == "broken state":
         bad = before.params._replace(scale=jnp.float32(jnp.nan))
         before = before._replace(params=bad)
@@ -184,14 +186,18 @@ def test_imagined_trials_end_and_stay():
     np.testing.assert_allclose(steps.next_obs[-1, :, 0, 0], [0.6, 0.2], rtol=1e-6)
 
 
+@pytest.mark.parametrize("squash", [0.0, 10.0])
 @pytest.mark.parametrize(
     ("name", "reward"), [("two", 2.0), ("minus one", -1.0), ("nothing", 0.0)]
 )
-def test_a_constant_reward_is_worth_its_sum_for_ever(name, reward):
-    learned = learn(name)
-    # What is left of the weights' first values.
-    np.testing.assert_allclose(learned.value(), 10.0 * reward, atol=0.5)
+def test_a_constant_reward_is_worth_its_sum_for_ever(name, reward, squash):
+    learned = learn(name, squash=squash)
+    # What is left of the weights' first values; squashed the largest is the flattest.
+    atol = 1.5 if squash else 0.5
+    np.testing.assert_allclose(learned.value(), 10.0 * reward, atol=atol)
     np.testing.assert_allclose(learned.metrics.reward, reward, rtol=1e-5)
+    if reward:  # said while it was still learned
+        assert 0.0 < learned.metrics.value / reward < 12.0
     assert learned.metrics.num_skipped == 0
 
 
@@ -268,6 +274,14 @@ def test_no_value_is_beyond_the_rewards():
     assert (biases(near) != biases(ends[0])).all()
 
 
+def test_a_learner_squashes_as_it_is_told():
+    params = PlanParams(WORLD, Task(*map(jnp.float32, TASKS["two"])))
+    for squash in (0.0, 3.0):
+        init = build(squash=squash).init
+        state = jax.jit(init)(params, jax.random.key(0), states())
+        assert state.params.squash == squash
+
+
 def test_pessimism_takes_the_lesser_of_the_critics():
     least, mean, between = (
         biases(one_update(TASKS["far"], pessimism=x)[1]) for x in (1.0, 0.0, 0.5)
@@ -339,6 +353,7 @@ def test_a_gradient_too_large_to_square_is_dropped():
         (dict(discount=1.0), ValueError, "discount must be below 1, got 1.0"),
         (dict(discount=jnp.float32(1)), ValueError, "discount must be below 1, got 1"),
         (dict(trace=1.5), ValueError, r"trace must be in \[0, 1\], got 1.5"),
+        (dict(squash=-1.0), ValueError, "squash must be finite and at least 0, got -1"),
         (dict(horizon=0), ValueError, "horizon must be at least 1, got 0"),
         (dict(goals=3), TypeError, "goals must be a Goals, got"),
         (dict(goals=Goals(3)), TypeError, r"goals.draw must be a function, got 3"),

@@ -110,7 +110,7 @@ ONE = np.ones(1, np.float32)
 BOX = dict(action_low=-ONE, action_high=ONE)
 CHANCE = jaxpets.random_planner(-ONE, ONE)
 LEARNED = (toys.cart, toys.reach, optax.adam(1e-3))
-PARAMS = policies.ActorCriticParams(*[()] * 5)
+PARAMS = policies.ActorCriticParams(*[()] * 6)
 BUILD = {
     "ensemble": lambda space, **sizes: jaxpets.ensemble(
         jaxpets.EnsembleConfig(), space, action_size=1, **sizes

@@ -54,11 +54,20 @@ def states(count=200, reach=1.0):
 
 
 @functools.cache
-def learned():
+def compiled():
+    distiller = build()
+    return distiller, jax.jit(distiller.init), jax.jit(distiller.step)
+
+
+@functools.cache
+def learned(squash=0.0):
     """The distiller, its states before and after, and what is said of every call."""
-    distiller, known = build(), PlanParams(GAIN, TARGETS)
-    before = jax.jit(distiller.init)(known, jax.random.key(0), states())
-    step, state, said = jax.jit(distiller.step), before, []
+    distiller, init, step = compiled()
+    known = PlanParams(GAIN, TARGETS)
+    before = init(known, jax.random.key(0), states())
+    params = before.params._replace(squash=jnp.float32(squash))
+    before = before._replace(params=params)
+    state, said = before, []
     for i in range(5):
         state, metrics = step(known, jax.random.key(i), state, states())
         said.append(metrics)
@@ -96,8 +105,9 @@ def test_it_gets_closer_to_the_planner():
     assert all(metrics.num_skipped == 0 for metrics in said)
 
 
-def test_a_value_is_what_the_planner_expects():
-    distiller, _, state, _ = learned()
+@pytest.mark.parametrize("squash", [0.0, 10.0])
+def test_a_value_is_what_the_planner_expects(squash):
+    distiller, _, state, _ = learned(squash)
     target, rows = TARGETS[1], states().data.obs[:20]
 
     def expected(key, obs):

@@ -65,6 +65,19 @@ def test_a_policy_that_was_rounded_is_one_of_float32(policy, saved, tmp_path):
     toys.assert_trees_close(found, policy[1], rtol=1e-3, atol=1e-6)
 
 
+def test_a_file_that_does_not_know_of_squashed_values_has_none(policy, tmp_path):
+    params = policy[1]._replace(squash=jnp.float32(10.0))
+    path = tmp_path / "p"
+    policies.save_policy(path, params, SPACE, obs_size=SIZE, **BOX)
+    assert policies.load_policy(path, goals=GOALS)[1].squash == 10.0
+    with safe_open(path, "np") as file:
+        texts = dict(file.metadata())
+    arrays = load_file(path)
+    assert arrays.pop("squash") == 10.0
+    save_file(arrays, path, texts)
+    assert policies.load_policy(path, goals=GOALS)[1].squash == 0.0
+
+
 def test_own_functions_are_not_saved(policy, tmp_path):
     planner, params, obs = policy
     own = SPACE._replace(coordinates=())
