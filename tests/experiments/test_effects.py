@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from small_logs import write_run
 
-from experiments.report import stats
+from experiments.report import stats, tables
 from experiments.storage.archive import unpack
 from experiments.tools import effects
 from jaxpets.envs import half_cheetah as cheetah
 
 LENGTH = 20
 TASKS = Path(effects.__file__).parents[1] / "sweeps/half_cheetah_tasks.py"
+RESULTS = Path(__file__).parents[2] / "results"
+STUDY = RESULTS / "study"
 
 
 def performed(folder, arm, tag, returns, upright=10.0):
@@ -163,20 +165,41 @@ def test_a_trial_whose_physics_diverged_is_no_ceiling(tmp_path):
     assert effects.ceilings(path) == {"jump": 2.0}
 
 
-def test_the_study_is_what_its_logs_say(tmp_path, capsys):
-    root = Path(__file__).parents[2]
-    study = root / "results" / "study"
-    for path in study.glob("*.tar.xz"):
-        if path.name not in ("stopped.tar.xz", "margin.tar.xz"):
-            unpack(path, tmp_path)
+@pytest.mark.parametrize(
+    "results", sorted(RESULTS.glob("study*.json")), ids=lambda path: path.stem
+)
+def test_a_study_is_what_its_logs_say(results, tmp_path):
+    of_robot = results.stem.removeprefix("study")
+    names = [of_robot.strip("-")] if of_robot else _half_cheetahs()
+    for name in names:
+        unpack(STUDY / f"{name}.tar.xz", tmp_path)
     found = tmp_path / "found.json"
-    flags = ["--ceilings", str(study / "simulator.jsonl"), "--json", str(found)]
+    ceilings = f"most{of_robot}.jsonl" if of_robot else "simulator.jsonl"
+    flags = ["--ceilings", str(STUDY / ceilings), "--json", str(found)]
     assert effects.main([str(tmp_path), *flags]) == 0
-    assert json.loads(found.read_text()) == json.loads(
-        (root / "results" / "study.json").read_text()
-    )
-    page = (root / "results" / "study.md").read_text()
-    shown = sections(capsys.readouterr().out)
+    assert json.loads(found.read_text()) == json.loads(results.read_text())
+
+
+def _half_cheetahs():
+    others = {"stopped", "margin", "walker", "quadruped"}
+    return {path.name.removesuffix(".tar.xz") for path in STUDY.glob("*.xz")} - others
+
+
+@pytest.mark.parametrize("robot", ["walker", "quadruped"])
+def test_a_page_has_what_the_study_of_two_more_robots_found(robot):
+    found = json.loads((RESULTS / f"study-{robot}.json").read_text())
+    page = (RESULTS / "study-robots.md").read_text()
+    known = ("stand", "walk", "run")[robot == "quadruped" :]
+    shown = sections("\n".join(effects.report(found, "best", known)))
+    for title in ("known tasks", "other tasks", "every task, refit-icem"):
+        assert "\n".join(shown[title]) in page
+
+
+def test_the_page_has_what_the_study_found():
+    found = json.loads((RESULTS / "study.json").read_text())
+    page = (RESULTS / "study.md").read_text()
+    lines = effects.report(found, "best", tables.TASKS)
+    shown = sections("\n".join(lines))
     place = 0
     for title, lines in shown.items():  # in the order in which they are printed
         if title not in _NOT_ON_THE_PAGE and not title.startswith("every task"):
@@ -185,7 +208,7 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
     rows = [line.strip("| ").split(" | ") for line in shown["other tasks"]]
     variants = rows[0]
     held_out = {row[0]: row for row in rows}
-    front = (root / "README.md").read_text()
+    front = (RESULTS.parent / "README.md").read_text()
     for words, variant in (
         ("CEM, no refit", "cem"),
         ("iCEM, after a refit", "refit-icem"),
@@ -196,11 +219,10 @@ def test_the_study_is_what_its_logs_say(tmp_path, capsys):
 
 
 def test_the_page_has_what_the_margin_brings(tmp_path, capsys):
-    study = Path(__file__).parents[2] / "results" / "study"
     runs, margin = tmp_path / "runs", tmp_path / "study-margin"
     for name, folder in (("best", runs), ("margin", tmp_path)):
-        unpack(study / f"{name}.tar.xz", folder)
-    flags = ["--ceilings", str(study / "simulator.jsonl")]
+        unpack(STUDY / f"{name}.tar.xz", folder)
+    flags = ["--ceilings", str(STUDY / "simulator.jsonl")]
     assert effects.main([str(runs), str(margin), *flags]) == 0
     shown = sections(capsys.readouterr().out)
     variants = shown["other tasks, less `best`, %"][0].strip("| ").split(" | ")
@@ -213,7 +235,7 @@ def test_the_page_has_what_the_margin_brings(tmp_path, capsys):
     assert papers[at] == "1.1 [-4.1, 6.3]"
     means = [float(x.split()[0]) for x in (*held_out[1:], *papers[1:])]
     assert max(map(abs, means)) == 1.5
-    page = (study.parent / "study.md").read_text()
+    page = (RESULTS / "study.md").read_text()
     assert "`best` scores 0.2 [-2.8, 3.2] less on held-out tasks" in page
 
 
@@ -226,10 +248,9 @@ _ON_THE_FRONT = ("best", "epistemic", "info-gain", "random")
 
 
 def test_the_page_has_what_models_know_of_all_data():
-    root = Path(__file__).parents[2] / "results"
-    page = (root / "study.md").read_text()
+    page = (RESULTS / "study.md").read_text()
     found = {
-        name: json.loads((root / "study" / f"{name}.json").read_text())
+        name: json.loads((STUDY / f"{name}.json").read_text())
         for name in ("open_loop", "model_error")
     }
     assert found["open_loop"]["trials"] == found["model_error"]["trials"]
