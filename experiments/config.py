@@ -155,7 +155,7 @@ class ImaginationConfig:
     pessimism: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """1: learn from the lesser of two critics; 0: from their mean."""
     squash: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
-    """Values are learned as logarithms, this often the largest; 0: as they are."""
+    """Critics learn logarithms, this much steeper at 0; 0: they learn values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +184,7 @@ class DistillingConfig:
     """Of Adam, at first; it falls to a twentieth."""
     hidden_size: Annotated[int, Meta(ge=1, le=8192)] = DistillConfig.hidden_size
     """Width of the policy's two layers."""
-    critic: ImaginationConfig = ImaginationConfig(60_000, 1e-3, 1024, 10, squash=10.0)
+    critic: ImaginationConfig = ImaginationConfig(60_000, batch_size=1024, horizon=10)
     """How it is imagined."""
 
 

@@ -22,7 +22,16 @@ import jaxpets
 from jaxpets.envs import Tasks
 from jaxpets.policies import ActorCriticParams, Distiller, Guided
 
-from . import acting, cost, exploration, imagined_policy, records, robots, seen
+from . import (
+    acting,
+    cost,
+    exploration,
+    imagined_policy,
+    kept_networks,
+    records,
+    robots,
+    seen,
+)
 from .acting import Actors, Scorer, Trials
 from .build import DISTILL, Parts, State, build, key_per, trial_keys
 from .config import Config
@@ -106,8 +115,8 @@ def distill(
     )  # fmt: skip
     begin = time.monotonic()
     with progress.interruptible():
-        found = run.restore(_template(now))
-        state = found[1] if found else _explored(now, source)
+        found = kept_networks.restored(run, _template(now))
+        state = found or _explored(now, source)
         planned = _perform(now, _PLANNER, state, 0, count)
         progress.line(_returns(now, "the planner", _rows(now, _PLANNER, planned)))
         if not found:

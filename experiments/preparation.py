@@ -12,7 +12,7 @@ import jaxpets
 from jaxpets.envs import Tasks
 from jaxpets.policies import ActorCriticParams
 
-from . import critic, exploration, robots
+from . import critic, exploration, kept_networks, robots
 from .build import CRITIC, Parts, State, key_per, trial_keys
 from .config import Config
 from .model_file import Source
@@ -47,8 +47,8 @@ def prepared(
       tasks: K of the robot's.
     """
     form = template(config, parts, tasks)
-    if found := run.restore(form):
-        return found[1]
+    if found := kept_networks.restored(run, form):
+        return found
     if parts.refitter or parts.critic:
         learner = exploration.learned(config, parts)
         state = source.restore_trial(step, learner, part=True)

@@ -32,7 +32,8 @@ _SMOKE_PLANNER = PlannerConfig(
 )
 _NO_REFIT = TrainingConfig(0)
 # A policy is imagined on a GPU; on two cores the planner teaches it.
-_NOT_IMAGINED = dataclasses.replace(DistillingConfig.critic, num_updates=0)
+_IMAGINED = dataclasses.replace(DistillingConfig.critic, squash=10.0)
+_NOT_IMAGINED = dataclasses.replace(_IMAGINED, num_updates=0)
 _LAPTOP_DISTILL = DistillingConfig(
     10, num_trials=20, horizon=150, num_updates=2000, critic=_NOT_IMAGINED
 )
@@ -40,7 +41,7 @@ _LAPTOP_DISTILL = DistillingConfig(
 # third as large, and trains longer on the little data there is, so that nothing is left
 # for a refit. Many short trials beat few long ones.
 PRESETS = {
-    "paper": Config(preset="paper"),
+    "paper": Config(preset="paper", distill=DistillingConfig(critic=_IMAGINED)),
     "laptop": Config(
         preset="laptop",
         num_trials=48,

@@ -66,7 +66,8 @@ def actor_critic(
     model explored without a reward imagines. They start in states of the data, keep
     their member as TS-infinity does (section 3.2), and act by the actor, with noise.
     Two critics learn its lambda-returns; the actor climbs the mean of the critics, as
-    in DDPG (Lillicrap et al., 2015).
+    in DDPG (Lillicrap et al., 2015). With `config.squash` both are of logarithms, as in
+    DreamerV3 (Hafner et al., 2023).
 
     A value is at most the largest reward seen or imagined so far, for ever, and at
     least the smallest; returns beyond are clipped, so that no error feeds itself.

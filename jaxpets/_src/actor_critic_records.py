@@ -32,9 +32,10 @@ class ActorCriticConfig:
         them, so that what the actor leads to is learned as well as what was seen.
       target_rate: share of the critics that their slow copies take over in a step.
       pessimism: 1 learns from the lesser of two critics, 0 from their mean.
-      squash: with more than 0 critics learn `sign(v) log(1 + squash |v|)` of a value v
-        in units of the largest that rewards of the data allow. Some tasks of a family
-        earn far less than others; so their values still tell actions apart.
+      squash: above 0 critics learn `sign(v) log(1 + squash |v|) / log(1 + squash)` of a
+        value v in units of the largest that rewards of the data allow. Some tasks of a
+        family earn far less than others; so their values still tell actions apart. What
+        is learned is then a mean of logarithms: where returns vary, less than the mean.
     """
 
     hidden_size: int = 256

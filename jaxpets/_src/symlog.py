@@ -3,6 +3,9 @@
 import jax.numpy as jnp
 from jax import Array
 
+# A critic's error is a power here: two that are infinite would differ by NaN.
+_LARGEST_POWER = 60.0
+
 
 def symlog(value: Array, squash: Array) -> Array:
     """Returns `sign(v) log(1 + squash |v|) / log(1 + squash)`: -1, 0 and 1 stay.
@@ -20,9 +23,10 @@ def symlog(value: Array, squash: Array) -> Array:
 
 
 def symexp(value: Array, squash: Array) -> Array:
-    """Returns what `symlog` makes this value of."""
+    """Returns what `symlog` makes this value of; what is too large stays finite."""
     rate, is_on = _rate(squash)
-    found = jnp.sign(value) * jnp.expm1(jnp.abs(value) * jnp.log1p(rate)) / rate
+    power = jnp.minimum(jnp.abs(value) * jnp.log1p(rate), _LARGEST_POWER)
+    found = jnp.sign(value) * jnp.expm1(power) / rate
     return jnp.where(is_on, found, value)
 
 

@@ -359,6 +359,7 @@ def test_the_paper_preset_has_the_numbers_of_the_paper():
 def test_a_policy_is_imagined_at_the_size_of_the_paper_alone():
     imagined = ImaginationConfig(60_000, batch_size=1024, horizon=10, squash=10.0)
     own = {name: config.distill for name, config in PRESETS.items()}
+    assert all(x.critic.squash == 10.0 for x in own.values())
     assert (own["paper"].num_rounds, own["paper"].critic) == (0, imagined)
     assert (own["laptop"].num_rounds, own["laptop"].critic.num_updates) == (10, 0)
     assert (own["smoke"].num_rounds, own["smoke"].critic.num_updates) == (2, 0)

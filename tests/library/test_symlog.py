@@ -40,6 +40,11 @@ def test_slopes_are_finite_and_not_negative(function, squash):
     assert np.isfinite(slopes).all() and (slopes >= 0.0).all()
 
 
+def test_what_is_too_large_stays_finite():
+    for value in (-1e3, 1e3):
+        assert np.isfinite(symexp(jnp.float32(value), jnp.float32(10.0)))
+
+
 def test_small_values_count_for_more():
     """A thousandth of the largest counts for more than four."""
     small = symlog(jnp.float32(0.001), jnp.float32(10.0))
