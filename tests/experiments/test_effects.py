@@ -174,7 +174,8 @@ def test_a_study_is_what_its_logs_say(results, tmp_path):
     for name in names:
         unpack(STUDY / f"{name}.tar.xz", tmp_path)
     found = tmp_path / "found.json"
-    ceilings = f"most{of_robot}.jsonl" if of_robot else "simulator.jsonl"
+    kind = "most" if of_robot == "-quadruped" else "simulator"
+    ceilings = f"{kind}{of_robot}.jsonl"
     flags = ["--ceilings", str(STUDY / ceilings), "--json", str(found)]
     assert effects.main([str(tmp_path), *flags]) == 0
     assert json.loads(found.read_text()) == json.loads(results.read_text())
