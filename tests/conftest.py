@@ -7,22 +7,17 @@ import shutil
 import signal
 import sys
 import tempfile
-from importlib import metadata
 from pathlib import Path
+
+import quick_xla
 
 # Before jax is imported. For the tests marked gpu: JAX_PLATFORMS=cuda,cpu.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-# Nearly all time goes into compiling, and on CPUs a good part of that into LLVM's
-# optimisations and XLA's fused loops: without them the suite takes half of the time.
-# A program in one part, not in 32 for as many cores, takes a fifth less to compile.
 # Flags of the user's own come last, and win; processes that tests start inherit these.
 if os.environ["JAX_PLATFORMS"] == "cpu":
-    _flags = "--xla_backend_optimization_level=0"
-    if metadata.version("jaxlib").startswith("0.10."):  # later ones do not know it
-        _flags += " --xla_cpu_use_fusion_emitters=false"
-        _flags += " --xla_cpu_parallel_codegen_split_count=1"
-    os.environ["XLA_FLAGS"] = f"{_flags} {os.environ.get('XLA_FLAGS', '')}".strip()
+    _flags = f"{quick_xla.FLAGS} {os.environ.get('XLA_FLAGS', '')}"
+    os.environ["XLA_FLAGS"] = _flags.strip()
 
 import jax
 import pytest
