@@ -1,4 +1,4 @@
-"""The set that is run on a GPU: plan, fit, rollout, env and trace, in a few minutes.
+"""The set that is run on a GPU: plan, fit, rollout, env and trace, in twelve minutes.
 
 Then prints all rows beside those that are committed for the same kind of device, and
 the plans of other systems. Its exit code is 1 if anything is slower than nine tenths
