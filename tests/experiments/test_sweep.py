@@ -226,7 +226,6 @@ def test_what_is_not_valid_is_refused_before_anything_runs(
 
 @pytest.mark.slow
 def test_a_run_that_fails_does_not_keep_the_others(file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")
     monkeypatch.setenv("PYTHONPATH", str(Path(grid.__file__).parents[1]))
     path, runs = file(FILE), tmp_path / "runs"
     runs.mkdir()

@@ -22,6 +22,8 @@ from jaxpets.policies import (
     actor_critic,
 )
 
+pytestmark = pytest.mark.slow
+
 NUM_UPDATES = 500
 DIVIDED = 6  # calls for a task that needs more
 

@@ -15,6 +15,8 @@ from jaxpets._src.distill_records import Plans
 from jaxpets._src.distill_update import keep
 from jaxpets.policies import DistillConfig, Goals, Guided
 
+pytestmark = pytest.mark.slow
+
 GAIN, HORIZON = jnp.float32(3.0), 4
 TARGETS = jnp.array([-0.6, 0.6], jnp.float32)
 SEARCH = toys.optimizer("icem", horizon=HORIZON)

@@ -9,6 +9,8 @@ import pytest
 import toys
 from cases import CASES, KEYED, STATEFUL
 
+pytestmark = pytest.mark.slow
+
 # Programs that fuse otherwise round otherwise; a search of a few iterations on values
 # that differ by far more than a rounding keeps to 1e-4.
 CLOSE = dict(rtol=1e-4, atol=1e-5)
