@@ -167,9 +167,9 @@ class Panel:
         count = self._presses.qsize()
         return list(dict.fromkeys(self._presses.get_nowait() for _ in range(count)))
 
-    def show_back(self, back: float) -> None:
-        """Has the slider say that nothing but now is looked at."""
-        if back == 0 and self._back.value != 0:
+    def show_back(self, back: float, seen: float) -> None:
+        """Has the slider say that only now is looked at, unless it has moved since."""
+        if back == 0 and self.back == seen != 0:
             self._back.value = 0.0
 
     # For the thread that shows.

@@ -42,7 +42,7 @@ class Page:
         self._panel = Panel(server, title, pushes=pushes, save=self._save)
         self._part = make_part(self._panel)
         self._panel.add_memory()
-        self._part.show_line(session.command.line)
+        self._part.show_line(session.command.line, "")
         self._controls = Controls(commands, self._part.read(0.0))
         self._is_saving = threading.Lock()
         self._complaints: set[str] = set()
@@ -50,10 +50,10 @@ class Page:
     def steer(self, session: Session) -> None:
         """Reads the controls, for the thread of the world."""
         with self._unharmed():
-            values = self._part.read(self._panel.back)
-            values = self._controls.apply(session, values, self._panel.presses())
-            self._part.show_line(values.line)
-            self._panel.show_back(values.back)
+            seen = self._part.read(self._panel.back)
+            values = self._controls.apply(session, seen, self._panel.presses())
+            self._part.show_line(values.line, seen.line)
+            self._panel.show_back(values.back, seen.back)
 
     def run(self, is_over: Callable[[float], bool], rate: float) -> None:
         """Shows what there is to be shown.

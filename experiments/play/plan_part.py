@@ -53,9 +53,9 @@ class PlanPart:
         sliders = tuple(slider.value for slider in self._sliders)
         return Values(self._line.value, sliders, self._effort.value, back)
 
-    def show_line(self, line: str) -> None:
-        """Has the line say what is asked for."""
-        if self._line.value != line:
+    def show_line(self, line: str, seen: str) -> None:
+        """Has the line say what is asked for, unless it says more than was seen."""
+        if self._line.value == seen != line:
             self._line.value = line
 
     def speak(self, session: Session, frame: Frame) -> None:

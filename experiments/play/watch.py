@@ -145,7 +145,7 @@ class RunPart:
         """Returns how far back is looked."""
         return Values("", (), 0.0, back)
 
-    def show_line(self, line: str) -> None:
+    def show_line(self, line: str, seen: str) -> None:
         """Has no line."""
 
     def speak(self, session: Session, frame: Frame) -> None:

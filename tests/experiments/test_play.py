@@ -52,6 +52,8 @@ from experiments.play import (  # noqa: E402
 )
 from experiments.play.controls import Controls, Press, Values  # noqa: E402
 from experiments.play.live import Live  # noqa: E402
+from experiments.play.page import Page  # noqa: E402
+from experiments.play.plan_part import PlanPart  # noqa: E402
 from experiments.play.scene import Look  # noqa: E402
 
 STEP = 0.05
@@ -591,6 +593,34 @@ def test_a_page_does_what_visitors_ask(visitor):
     visitor.sees("0.5 s ago")
     visitor.sets("and", "go on from here")
     visitor.sees("of the model's own noise")
+
+
+def test_what_is_asked_for_while_an_order_is_obeyed_comes_next(
+    cheetah, commands, live, monkeypatch
+):
+    """Whoever sees what was pressed may type before the line says it too."""
+    robot, _, _ = cheetah
+    session = Session(live, commands.first)
+    session.restart()
+    listener, obey = socket.create_server(("127.0.0.1", 0)), commands.by_name
+
+    def interrupted(*order):
+        page._part._line.value = "height"
+        page._panel._back.value = -0.5
+        return obey(*order)
+
+    with server.serving(listener, "") as gui:
+        page = Page(
+            gui, robot, robot.name, session, "", commands,
+            lambda panel: PlanPart(panel, commands, 4, has_policy=False),
+        )  # fmt: skip
+        monkeypatch.setattr(commands, "by_name", interrupted)
+        page._panel._presses.put(Press("reward", "backward"))
+        page.steer(session)
+        assert session.command.line == commands.tasks["backward"]
+        assert page._panel.back == 0.5
+        page.steer(session)
+        assert (session.command.line, session.command.problem) == ("height", "")
 
 
 def test_what_was_seen_is_one_file(cheetah, commands, live):
