@@ -169,7 +169,7 @@ class Panel:
 
     def show_back(self, back: float, seen: float) -> None:
         """Has the slider say that only now is looked at, unless it has moved since."""
-        if back == 0 and self.back == seen != 0:
+        if back == 0 and self.back == seen and self._back.value != 0:
             self._back.value = 0.0
 
     # For the thread that shows.

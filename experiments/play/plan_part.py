@@ -54,7 +54,7 @@ class PlanPart:
         return Values(self._line.value, sliders, self._effort.value, back)
 
     def show_line(self, line: str, seen: str) -> None:
-        """Has the line say what is asked for, unless it says more than was seen."""
+        """Has the line say what is asked for, unless it has changed since."""
         if self._line.value == seen != line:
             self._line.value = line
 
