@@ -93,6 +93,7 @@ LAYERS = {
     "_src.agent_steps": 7,
     "_src.agent": 8,
     "envs.extra": 0,
+    "envs.host_call": 0,
     "envs.native": 1,
     "envs.symmetry": 1,
     "envs.observations": 2,

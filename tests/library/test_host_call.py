@@ -1,0 +1,167 @@
+"""A function of NumPy inside JAX programs: `jaxpets.envs.host_call`."""
+
+import ctypes
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpets.envs import host_call as module
+from jaxpets.envs.host_call import host_call
+
+
+def sums(rows):
+    """Returns the sum of a row, and that of its squares."""
+    assert isinstance(rows, np.ndarray)
+    return np.stack([rows.sum(-1), (rows**2).sum(-1)], -1)
+
+
+def counted(calls):
+    def function(rows):
+        calls.append(rows.shape)
+        return sums(rows)
+
+    return host_call(function, 2)
+
+
+@pytest.fixture
+def inputs():
+    return jax.random.normal(jax.random.key(0), (3, 4, 5))
+
+
+def test_it_is_the_function(inputs):
+    call = host_call(sums, 2)
+    for got in (call(inputs[0, 0]), jax.jit(call)(inputs[0, 0])):
+        assert got.shape == (2,)
+        np.testing.assert_array_equal(got, sums(np.asarray(inputs[0, 0])))
+
+
+def test_any_nest_of_vmaps_is_one_call(inputs):
+    calls = []
+    every = jax.jit(jax.vmap(jax.vmap(counted(calls), 1)))
+    got = every(inputs)
+    assert calls == [(3, 5, 4)] and got.shape == (3, 5, 2)
+    np.testing.assert_array_equal(got, sums(np.asarray(inputs).swapaxes(1, 2)))
+
+
+def test_a_scan_calls_it_every_time(inputs):
+    calls = []
+    call = counted(calls)
+
+    def step(carry, row):
+        carry = carry + call(row)
+        return carry, carry
+
+    last, every = jax.jit(lambda rows: jax.lax.scan(step, jnp.zeros(2), rows))(
+        inputs[0]
+    )
+    assert calls == [(5,)] * 4
+    np.testing.assert_allclose(every, np.cumsum(sums(np.asarray(inputs[0])), 0), 1e-6)
+    np.testing.assert_array_equal(last, every[-1])
+
+
+def test_what_the_function_raises_is_told(inputs):
+    def function(rows):
+        raise ValueError("the robot has left the room")
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the robot has left the room"):
+        jax.block_until_ready(jax.jit(host_call(function, 2))(inputs[0, 0]))
+
+
+def test_platforms_that_have_neither_get_a_pure_callback(inputs, monkeypatch):
+    def default(*operands, default, **_):
+        return default(*operands)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", default)
+    call = host_call(sums, 2)
+    assert "pure_callback[" in str(jax.make_jaxpr(call)(inputs[0, 0]))
+    got = jax.jit(jax.vmap(jax.vmap(call)))(inputs)
+    np.testing.assert_array_equal(got, sums(np.asarray(inputs)))
+
+
+# -- a GPU, and its driver ------------------------------------------------------------
+
+
+class Buffer:
+    """Memory of the host in the place of a GPU's."""
+
+    def __init__(self, array):
+        self.array, self.shape = array, array.shape
+        self.__cuda_array_interface__ = {"data": (array.ctypes.data, False)}
+
+
+class Context:
+    stream = 7
+
+
+class Driver:
+    """What is called of libcuda, with memory of the host."""
+
+    def __init__(self, error=0):
+        self.called, self.error = [], error
+
+    def copy(self, there, here, size, stream):
+        assert stream.value == Context.stream
+        ctypes.memmove(there, here, size.value)
+        return self.error
+
+    def cuMemcpyDtoHAsync_v2(self, *arguments):  # noqa: N802 - the driver's name
+        self.called.append("from")
+        return self.copy(*arguments)
+
+    def cuStreamSynchronize(self, stream):  # noqa: N802 - the driver's name
+        assert stream.value == Context.stream
+        self.called.append("wait")
+        return 0
+
+    def cuMemcpyHtoDAsync_v2(self, *arguments):  # noqa: N802 - the driver's name
+        self.called.append("to")
+        return self.copy(*arguments)
+
+
+@pytest.fixture
+def on_cuda(monkeypatch):
+    """Returns what is called of a GPU, given a driver."""
+
+    def build(driver):
+        made = {}
+
+        def taken(callback, shape, **_):
+            made[callback.__name__] = callback
+            return lambda _: jnp.zeros(shape.shape)
+
+        monkeypatch.setattr(module, "buffer_callback", taken)
+        monkeypatch.setattr(ctypes, "CDLL", lambda name: driver)
+        module._driver.cache_clear()
+        host_call(sums, 2)(jnp.zeros(5))
+        return made["on_cuda"]
+
+    yield build
+    module._driver.cache_clear()
+
+
+def test_a_gpu_copies_there_and_back(on_cuda):
+    driver = Driver()
+    rows = np.arange(15, dtype=np.float32).reshape(3, 5)
+    out = np.zeros((3, 2), np.float32)
+    on_cuda(driver)(Context, Buffer(out), Buffer(rows))
+    np.testing.assert_array_equal(out, sums(rows))
+    assert driver.called == ["from", "wait", "to"]
+
+
+def test_an_error_of_the_driver_is_told(on_cuda):
+    rows, out = np.zeros((1, 5), np.float32), np.zeros((1, 2), np.float32)
+    with pytest.raises(RuntimeError, match=r"cuMemcpyDtoHAsync_v2 .* failed with 201"):
+        on_cuda(Driver(error=201))(Context, Buffer(out), Buffer(rows))
+
+
+@pytest.mark.gpu
+def test_a_gpu_calls_the_function(inputs):
+    device = jax.devices("gpu")[0]
+    calls = []
+    every = jax.jit(jax.vmap(jax.vmap(counted(calls))))
+    got = every(jax.device_put(inputs, device))
+    assert got.devices() == {device} and calls == [(3, 4, 5)]
+    np.testing.assert_array_equal(got, sums(np.asarray(inputs)))
+    assert "pure_callback" not in every.lower(inputs).as_text()
