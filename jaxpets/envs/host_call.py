@@ -11,6 +11,8 @@ import numpy as np
 from jax import Array
 from jax.experimental.buffer_callback import buffer_callback
 
+_CPU = 1  # DLPack's number of it
+
 
 def host_call(
     function: Callable[[np.ndarray], np.ndarray], size: int
@@ -21,42 +23,55 @@ def host_call(
     which takes longer than a step of MuJoCo. It is used where there is no other way.
 
     Args:
-      function: `[..., I] -> [..., size]`, float32. It must not write to what it gets,
-        nor call JAX: that could wait for itself for ever.
+      function: `[..., I] -> [..., size]`, float32. What it gets may not be written to,
+        and is another's memory once it has returned. It must not call JAX, which could
+        wait for itself for ever.
       size: of the last axis of what it returns.
 
     Returns:
-      `[I] -> [size]`. Under any nest of `jax.vmap` the host is called once for the
-      whole batch. It has no gradient.
+      `[I] -> [size]`, float32; a call fails if `function` returns another shape. Under
+      any nest of `jax.vmap` the host is called once for the whole batch; of a program
+      over several devices each calls it, under `jax.shard_map` with its own share. It
+      has no gradient.
     """
 
-    def on_cpu(_: Any, out: Any, inputs: Any) -> None:
-        np.asarray(out)[...] = function(np.asarray(inputs))
+    def rows_of(inputs: np.ndarray, lead: tuple[int, ...]) -> np.ndarray:
+        inputs.flags.writeable = False
+        rows = np.ascontiguousarray(function(inputs), np.float32)
+        if rows.shape != (*lead, size):
+            raise ValueError(
+                f"the host's function must return {[*lead, size]}, got {[*rows.shape]}."
+            )
+        return rows
 
-    def on_cuda(context: Any, out: Any, inputs: Any) -> None:
+    def through(context: Any, out: Any, inputs: Any) -> None:
+        lead = inputs.shape[:-1]
+        # Of the memory and not of the program: JAX takes an eager call's platform to be
+        # the default one, wherever its array is.
+        if inputs.__dlpack_device__()[0] == _CPU:
+            np.asarray(out)[...] = rows_of(np.asarray(inputs), lead)
+            return
         cuda, stream = _driver(), context.stream
         rows = np.empty(inputs.shape, np.float32)
         cuda("cuMemcpyDtoHAsync_v2", _here(rows), _there(inputs), rows.nbytes, stream)
         cuda("cuStreamSynchronize", stream)
-        rows = np.ascontiguousarray(function(rows), np.float32)
-        # This returns once the rows have left memory that nobody pinned.
+        rows = rows_of(rows, lead)
         cuda("cuMemcpyHtoDAsync_v2", _there(out), _here(rows), rows.nbytes, stream)
+        cuda("cuStreamSynchronize", stream)  # the rows are gone after this
+
+    def elsewhere(inputs: Any) -> np.ndarray:
+        inputs = np.array(inputs)
+        return rows_of(inputs, inputs.shape[:-1])
 
     shape = jax.ShapeDtypeStruct((size,), jnp.float32)
-    method = "broadcast_all"
-
-    def through(callback: Callable[..., None]) -> Callable[..., Any]:
-        return cast(Any, buffer_callback)(callback, shape, vmap_method=method)
-
-    def elsewhere(inputs: Array) -> Array:
-        def host(rows: Any) -> np.ndarray:
-            return function(np.asarray(rows))
-
-        return jax.pure_callback(host, shape, inputs, vmap_method=method)
+    vmapped: Any = {"vmap_method": "broadcast_all"}
+    direct: Any = cast(Any, buffer_callback)(through, shape, **vmapped)
+    default = functools.partial(jax.pure_callback, elsewhere, shape, **vmapped)
 
     def call(inputs: Array) -> Array:
-        return cast(Any, jax.lax.platform_dependent)(
-            inputs, cpu=through(on_cpu), cuda=through(on_cuda), default=elsewhere
+        choose: Any = jax.lax.platform_dependent
+        return choose(
+            inputs.astype(jnp.float32), cpu=direct, cuda=direct, default=default
         )
 
     return call

@@ -45,7 +45,8 @@ def native_physics(
     Under any nest of `jax.vmap` the host is called once for the whole batch and spreads
     it over its threads; the result does not depend on how many there are. Threads and
     buffers are made at the first call that needs them, and go with the function.
-    Calls from several devices take turns.
+    Several devices call in turn, each for its share under `jax.shard_map`; under `jit`
+    alone each steps the whole batch.
 
     `mujoco.rollout` is not used: it does not return where its solver would start next.
 

@@ -50,16 +50,67 @@ def test_a_scan_calls_it_every_time(inputs):
     calls = []
     call = counted(calls)
 
-    def step(carry, row):
-        carry = carry + call(row)
-        return carry, carry
+    def step(count, row):
+        return count + 1, call(row)
 
-    last, every = jax.jit(lambda rows: jax.lax.scan(step, jnp.zeros(2), rows))(
-        inputs[0]
-    )
-    assert calls == [(5,)] * 4
-    np.testing.assert_allclose(every, np.cumsum(sums(np.asarray(inputs[0])), 0), 1e-6)
-    np.testing.assert_array_equal(last, every[-1])
+    run = jax.jit(lambda rows: jax.lax.scan(step, 0, rows))
+    count, every = run(inputs[0])
+    assert calls == [(5,)] * 4 and count == 4
+    np.testing.assert_array_equal(every, sums(np.asarray(inputs[0])))
+
+
+@pytest.mark.parametrize("dtype", [jnp.int32, jnp.bfloat16, jnp.float16])
+def test_inputs_become_float32(dtype):
+    def function(rows):
+        assert rows.dtype == np.float32
+        return sums(rows)
+
+    row = jnp.arange(5).astype(dtype)
+    np.testing.assert_array_equal(host_call(function, 2)(row), [10.0, 30.0])
+
+
+def test_an_empty_batch_needs_no_call():
+    calls = []
+    assert jax.vmap(counted(calls))(jnp.zeros((0, 5))).shape == (0, 2)
+    assert calls in ([], [(0, 5)])
+
+
+def test_an_eager_call_compiles_once(inputs, caplog):
+    call, compiled = host_call(sums, 2), []
+    for row in inputs[0]:
+        caplog.clear()
+        with jax.log_compiles(), caplog.at_level("WARNING"):
+            call(row)
+        compiled.append(sum("Compiling" in x for x in caplog.messages))
+    assert compiled[0] > 0 and not any(compiled[1:])
+
+
+def test_what_it_gets_cannot_be_written_to(inputs):
+    def function(rows):
+        rows[:] = 7.0
+        return sums(rows)
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="read-only"):
+        jax.block_until_ready(jax.jit(host_call(function, 2))(inputs[0, 0]))
+
+
+WRONG = [
+    lambda rows: rows.sum(-1, keepdims=True),
+    lambda rows: sums(rows)[..., None],
+    lambda rows: np.zeros(3),
+]
+
+
+@pytest.mark.parametrize("function", WRONG)
+def test_another_shape_is_refused(inputs, function):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"must return \[4, 2\], got"):
+        jax.block_until_ready(jax.jit(jax.vmap(host_call(function, 2)))(inputs[0]))
+
+
+def test_it_has_no_gradient(inputs):
+    call = host_call(sums, 2)
+    with pytest.raises(ValueError, match="do not support JVP"):
+        jax.grad(lambda x: call(x).sum())(inputs[0, 0])
 
 
 def test_what_the_function_raises_is_told(inputs):
@@ -100,6 +151,9 @@ class Buffer:
         self.array, self.shape = array, array.shape
         self.__cuda_array_interface__ = {"data": (array.ctypes.data, False)}
 
+    def __dlpack_device__(self):
+        return 2, 0  # CUDA
+
 
 class Context:
     stream = 7
@@ -132,20 +186,19 @@ class Driver:
 
 @pytest.fixture
 def on_cuda(monkeypatch):
-    """Returns what is called of a GPU, given a driver."""
+    """Returns what is called of a GPU with this driver and function."""
 
-    def build(driver):
-        made = {}
+    def build(driver, function=sums):
+        made = []
 
         def taken(callback, shape, **_):
-            made[callback.__name__] = callback
-            return lambda _: jnp.zeros(shape.shape)
+            made.append(callback)
 
         monkeypatch.setattr(module, "buffer_callback", taken)
         monkeypatch.setattr(ctypes, "CDLL", lambda name: driver)
         module._driver.cache_clear()
-        host_call(sums, 2)(jnp.zeros(5))
-        return made["on_cuda"]
+        host_call(function, 2)
+        return made[0]
 
     yield build
     module._driver.cache_clear()
@@ -153,11 +206,25 @@ def on_cuda(monkeypatch):
 
 def test_a_gpu_copies_there_and_back(on_cuda):
     driver = Driver()
+
+    def function(rows):
+        driver.called.append("function")
+        return sums(rows)
+
     rows = np.arange(15, dtype=np.float32).reshape(3, 5)
     out = np.zeros((3, 2), np.float32)
-    on_cuda(driver)(Context, Buffer(out), Buffer(rows))
+    on_cuda(driver, function)(Context, Buffer(out), Buffer(rows))
     np.testing.assert_array_equal(out, sums(rows))
-    assert driver.called == ["from", "wait", "to"]
+    assert driver.called == ["from", "wait", "function", "to", "wait"]
+
+
+@pytest.mark.parametrize("function", WRONG)
+def test_a_gpu_gets_no_other_shape(on_cuda, function):
+    driver = Driver()
+    rows, out = np.ones((4, 5), np.float32), np.zeros((4, 2), np.float32)
+    with pytest.raises(ValueError, match=r"must return \[4, 2\], got"):
+        on_cuda(driver, function)(Context, Buffer(out), Buffer(rows))
+    assert "to" not in driver.called and not out.any()
 
 
 def test_an_error_of_the_driver_is_told(on_cuda):

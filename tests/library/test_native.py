@@ -373,7 +373,7 @@ def test_experiments_choose_the_engine(engine, calls):
     env = build(config).robot.env
     state = jax.eval_shape(env.reset, jax.random.key(0))
     program = jax.make_jaxpr(env.step)(state, jnp.zeros(6, jnp.float32))
-    assert str(program).count("pure_callback[") == calls
+    assert str(program).count("= buffer_callback[") == calls
 
 
 @pytest.mark.gpu
