@@ -94,6 +94,7 @@ class Fit:
         rng = np.random.default_rng(seed)
 
         def with_biases(x):
+            x = np.asarray(x)
             noise = rng.normal(size=x.shape, scale=0.1).astype(np.float32)
             return np.where(x == 0.0, noise, x)
 
