@@ -35,33 +35,32 @@ def host_call(
       has no gradient.
     """
 
-    def rows_of(inputs: np.ndarray, lead: tuple[int, ...]) -> np.ndarray:
+    def rows_of(inputs: np.ndarray) -> np.ndarray:
         inputs.flags.writeable = False
         rows = np.ascontiguousarray(function(inputs), np.float32)
-        if rows.shape != (*lead, size):
+        wanted = (*inputs.shape[:-1], size)
+        if rows.shape != wanted:
             raise ValueError(
-                f"the host's function must return {[*lead, size]}, got {[*rows.shape]}."
+                f"the host's function must return {[*wanted]}, got {[*rows.shape]}."
             )
         return rows
 
     def through(context: Any, out: Any, inputs: Any) -> None:
-        lead = inputs.shape[:-1]
         # Of the memory and not of the program: JAX takes an eager call's platform to be
         # the default one, wherever its array is.
         if inputs.__dlpack_device__()[0] == _CPU:
-            np.asarray(out)[...] = rows_of(np.asarray(inputs), lead)
+            np.asarray(out)[...] = rows_of(np.asarray(inputs))
             return
         cuda, stream = _driver(), context.stream
         rows = np.empty(inputs.shape, np.float32)
         cuda("cuMemcpyDtoHAsync_v2", _here(rows), _there(inputs), rows.nbytes, stream)
         cuda("cuStreamSynchronize", stream)
-        rows = rows_of(rows, lead)
+        rows = rows_of(rows)
         cuda("cuMemcpyHtoDAsync_v2", _there(out), _here(rows), rows.nbytes, stream)
         cuda("cuStreamSynchronize", stream)  # the rows are gone after this
 
     def elsewhere(inputs: Any) -> np.ndarray:
-        inputs = np.array(inputs)
-        return rows_of(inputs, inputs.shape[:-1])
+        return rows_of(np.asarray(inputs))
 
     shape = jax.ShapeDtypeStruct((size,), jnp.float32)
     vmapped: Any = {"vmap_method": "broadcast_all"}

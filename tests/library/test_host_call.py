@@ -72,7 +72,7 @@ def test_inputs_become_float32(dtype):
 def test_an_empty_batch_needs_no_call():
     calls = []
     assert jax.vmap(counted(calls))(jnp.zeros((0, 5))).shape == (0, 2)
-    assert calls in ([], [(0, 5)])
+    assert not calls
 
 
 def test_an_eager_call_compiles_once(inputs, caplog):
