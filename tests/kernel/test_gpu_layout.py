@@ -58,6 +58,17 @@ def test_parameters_lie_as_documented(name):
     assert rest.shape == (2, 0)
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_gpu_packs_the_same(name):
+    """Also what rounding leaves of a bias, where XLA may leave out the rounding."""
+    layout, layers = LAYOUTS[name], layers_of(LAYOUTS[name])
+    expected = jax.jit(layout.pack)(layers)
+    with jax.default_device(jax.devices("gpu")[0]):
+        packed = jax.jit(layout.pack)(jax.tree.map(np.asarray, layers))
+    np.testing.assert_array_equal(packed, expected)
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_the_sources_have_the_same_sizes(assert_constants, name):
     layout = LAYOUTS[name]
