@@ -65,7 +65,7 @@ def test_a_gpu_packs_the_same(name):
     layout, layers = LAYOUTS[name], layers_of(LAYOUTS[name])
     expected = jax.jit(layout.pack)(layers)
     with jax.default_device(jax.devices("gpu")[0]):
-        packed = jax.jit(layout.pack)(jax.tree.map(np.asarray, layers))
+        packed = jax.jit(layout.pack)(layers)
     np.testing.assert_array_equal(packed, expected)
 
 
@@ -102,6 +102,17 @@ def test_what_float16_cannot_hold_is_as_large_as_can_be():
     assert found[0, 0, 0] == 65504 and found[0, 0, 1] == -65504
     assert np.isnan(found[1, 0, 0])
     assert np.isfinite(packed[0]).all()
+
+
+def test_a_bias_that_is_tiny_huge_or_no_number_lies_in_two_rows_as_well():
+    layers, rows = layers_of(SMALL), SMALL.input_size
+    biases = np.array([2e-5, -1e-6, 70_000, 1e9, -np.inf, np.nan], np.float32)
+    layers[0]["bias"][0, : biases.size] = 2 * biases
+    packed = np.float64(jax.jit(SMALL.pack)(layers))
+    found, _ = unpacked(packed, rows, SMALL.left)
+    got = found[0, rows, : biases.size] + found[0, rows + 1, : biases.size]
+    expected = np.clip(biases, -2 * 65504, 2 * 65504)
+    np.testing.assert_allclose(got, expected, rtol=2**-21, atol=2**-25)
 
 
 def test_members_do_not_mix():
