@@ -12,7 +12,7 @@ def test_two_blocks_share_a_multiprocessor_of_any_gpu_if_they_can():
     larger = {"quadruped": (60, 12, 63, (256,) * 4), "largest": (128, 128, 128, (256,))}
     for name, sizes in (SIZES | larger).items():
         layout = MmaLayout(*sizes)
-        tiles[name] = layout.ring()["TILES"]
+        tiles[name] = layout.block()["TILES"]
         assert layout.shared_bytes(tiles[name]) <= SHARED_MEMORY
         assert name in larger or layout.shared_bytes(tiles[name]) <= 49 * 1024
     assert tiles == dict.fromkeys(SIZES, 5) | {"quadruped": 5, "largest": 3}
@@ -32,7 +32,7 @@ def test_wide_layers_are_for_more_warps(sizes, warps, tiles):
     """Each has as many columns; one block is a multiprocessor's."""
     layout = MmaLayout(*sizes)
     assert layout.problem() is None
-    assert (layout.ring()["WARPS"], layout.ring()["TILES"]) == (warps, tiles)
+    assert (layout.block()["WARPS"], layout.block()["TILES"]) == (warps, tiles)
     assert layout.shared_bytes(tiles) <= SHARED_MEMORY
 
 

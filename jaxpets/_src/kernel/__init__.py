@@ -25,10 +25,13 @@ The numbers. Parameters are packed once per plan, and handed over at every call:
 
 Who includes whom:
 
-    wgmma_rollout.cu    gpu_layout.h, gpu_launch.h, wgmma.h, wgmma_warp.h
+    wgmma_rollout.cu    gpu_layout.h, gpu_launch.h, wgmma.h, wgmma_slice.h
     mma_rollout.cu      gpu_layout.h, gpu_launch.h, gpu_particles.h, mma_product.h
+    wgmma_slice.h       mma.h, wgmma_memory.h: a few particles that share their columns
+    wgmma_memory.h      hopper.h, wgmma_warp.h: what a block shares, who waits for what
     wgmma_warp.h        gpu_particles.h: particles whose activations are in registers
-    mma_product.h       gpu_layout.h: what a warp multiplies, and how its weights come
+    hopper.h            gpu_particles.h: barriers, and copies that arrive at them
+    mma_product.h       gpu_layout.h, mma.h: what a warp multiplies, and its weights
     gpu_launch.h        xla_call.h: how XLA's call becomes a launch
     gpu_particles.h     handler.h: what a warp or a block does with its particles
     gpu_reference.cc    gpu_layout.h, handler.h

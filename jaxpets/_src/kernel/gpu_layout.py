@@ -81,8 +81,8 @@ class GpuLayout(abc.ABC):
         """Returns why a model of allowed sizes has no room, or None."""
 
     @abc.abstractmethod
-    def ring(self) -> Mapping[str, int]:
-        """Returns how weights stream, as constants of the C++ sources."""
+    def block(self) -> Mapping[str, int]:
+        """Returns how a block of threads works, as constants of the C++ sources."""
 
     def products(self) -> str:
         """Returns what of the kernel's C++ has to be written for each model."""
@@ -98,7 +98,7 @@ class GpuLayout(abc.ABC):
             "LAYERS": len(self.hidden_sizes),
             "LEFT": self.left,
             "FRAGMENTS": int(self.fragments),
-            **self.ring(),
+            **self.block(),
         }
         lines = [f"constexpr int {name} = {n};" for name, n in constants.items()]
         return "\n".join(lines)

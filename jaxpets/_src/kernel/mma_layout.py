@@ -47,7 +47,7 @@ class MmaLayout(GpuLayout):
         """Returns None: there is room for a few particles of the largest model."""
         return None
 
-    def ring(self) -> Mapping[str, int]:
+    def block(self) -> Mapping[str, int]:
         """Returns of how many warps and tiles a block is: of as many as have room."""
         fitting = (n for n in range(_MOST_TILES, 1, -1) if self._fits(n))
         return {
