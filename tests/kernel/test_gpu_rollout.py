@@ -147,7 +147,7 @@ def kernel_of(case, kind):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("num_samples", [70, 1500])  # of a last block a part is empty
+@pytest.mark.parametrize("num_samples", [70, 1515])  # tiles and slices in part empty
 @pytest.mark.parametrize(
     "name", ["half_cheetah", "free joint", "ball joint", "sensors", "rich"]
 )
@@ -158,7 +158,7 @@ def test_the_kernel_equals_the_scan(name, num_samples, kind):
         args = case.args()
         got, want = jax.jit(fused)(*args), jax.jit(case.scan())(*args)
         # Its tanh and its exponential have 11 and 22 bits.
-        assert relative_error(got, want) <= 3e-4
+        assert relative_error(got, want) <= 1e-3
         many, axes = stacked(case, ["p", "k", "o", "a"])
         mapped = fused
         for in_axes in reversed(axes):
@@ -178,12 +178,13 @@ def test_a_wide_kernel_equals_the_scan(hidden_sizes, obs_size):
         fused = case.fused()
         assert fused.uses_kernel and not fused.arch.endswith("a")
         got, want = jax.jit(fused)(*case.args()), jax.jit(case.scan())(*case.args())
-        assert relative_error(got, want) <= 3e-4
+        assert relative_error(got, want) <= 1e-3
 
 
+# Blocks of one tile, of one and a slice, of two; weights that stay in shared memory, or
+# stream through a ring which holds a layer, or does not.
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", KINDS)
-# Blocks of one tile, of one and a slice, of two; weights that stay, or stream in part.
 @pytest.mark.parametrize("num_samples", [70, 500, 1000])
 @pytest.mark.parametrize(
     "hidden_sizes", [(64,), (200,) * 4, (208,) * 4, (256,) * 4, (128,) * 8]
@@ -195,14 +196,27 @@ def test_the_kernel_equals_the_scan_at_every_width(hidden_sizes, num_samples, ki
     with jax.default_device(jax.devices("gpu")[0]):
         fused = kernel_of(case, kind)
         got, want = jax.jit(fused)(*case.args()), jax.jit(case.scan())(*case.args())
-        assert relative_error(got, want) <= 3e-4
+        assert relative_error(got, want) <= 1e-3
+
+
+@pytest.mark.gpu
+def test_a_slice_with_many_entries_equals_the_scan():
+    """More than its warps draw at once."""
+    case = Case(60, 8, (64,) * 2, num_samples=1515)
+    with jax.default_device(jax.devices("gpu")[0]):
+        fused = kernel_of(case, Kind.WGMMA)
+        got, want = jax.jit(fused)(*case.args()), jax.jit(case.scan())(*case.args())
+        assert relative_error(got, want) <= 1e-3
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("num_samples", [250, 500, 1000])
-def test_nothing_overtakes_what_is_read(num_samples):
+@pytest.mark.parametrize("hidden_sizes", [(200,) * 4, (208,) * 4])
+def test_nothing_overtakes_what_is_read(hidden_sizes, num_samples):
     """What streams is overwritten as soon as all have read it: every time, the same."""
-    case = dataclasses.replace(PAPER, num_samples=num_samples, horizon=30)
+    case = dataclasses.replace(
+        CHEETAH, hidden_sizes=hidden_sizes, num_samples=num_samples, horizon=30
+    )
     with jax.default_device(jax.devices("gpu")[0]):
         imagine = jax.jit(kernel_of(case, Kind.WGMMA))
         first = imagine(*case.args())

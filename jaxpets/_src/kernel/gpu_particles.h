@@ -103,7 +103,7 @@ __device__ __forceinline__ void draw_targets(float* target, const float (&head)[
 }
 
 // Draws numbers `first + i * stride` of a step's normal(key, [E, N, P, OBS]) into rows of
-// OBS: those of this thread, of PER_THREAD each.
+// OBS: those of this thread, so many at once.
 template <int COUNT, int STRIDE, int AT_ONCE>
 __device__ __forceinline__ void draw_noise(float* rows, const uint32_t* key,
                                            uint32_t counter, int thread) {

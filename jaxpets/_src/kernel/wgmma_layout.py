@@ -9,14 +9,18 @@ from jaxpets._src.kernel.gpu_layout import DEPTH, GpuLayout, chunks, round_up
 SHARED_MEMORY = 232_448
 _TILE = 64  # rows of one instruction
 _SLICE = 16  # and of one by which older GPUs multiply
+# Chunks that stream together, and slots for them. Few large ones: each is waited for.
+_RINGS = ((6, 2), (4, 3), (4, 2))
 
 
 @dataclasses.dataclass(frozen=True)
 class Streaming:
-    """Chunks of each half of a hidden layer that stream, its first ones."""
+    """Chunks that stream of each half layer, how many at once, and the ring's slots."""
 
     left: int
     right: int
+    unit: int
+    slots: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,39 +44,52 @@ class WgmmaLayout(GpuLayout):
         return None
 
     def block(self) -> Mapping[str, int]:
-        """Returns what streams of the halves of a layer."""
+        """Returns what streams of the halves of a layer, and through which ring."""
         streaming = self.streaming()
         assert streaming is not None
-        return {"LEFT_STREAMED": streaming.left, "RIGHT_STREAMED": streaming.right}
+        return {
+            "LEFT_STREAMED": streaming.left,
+            "RIGHT_STREAMED": streaming.right,
+            "UNIT": streaming.unit,
+            "SLOTS": streaming.slots,
+        }
 
     def streaming(self) -> "Streaming | None":
-        """Returns how to split the weights between shared memory and what streams.
+        """Returns how to split the weights between shared memory and the ring.
 
-        As much as fits stays in shared memory. The left half of hidden layers streams
-        first: the products of the right half then never wait.
+        As much as fits stays in shared memory. The left halves of hidden layers stream
+        first: the right halves' products then never wait. A ring that takes all that
+        streams of a layer is preferred.
         """
         count = chunks(self.width)
-        for streamed in range(2 * count + 1):
-            left = min(streamed, count)
-            streaming = Streaming(left, streamed - left)
-            if self._shared_bytes(streaming) <= SHARED_MEMORY:
-                return streaming
-        return None
+        found: list[Streaming] = []
+        for most, slots in _RINGS:
+            unit = min(most, count)
+            half = count // unit * unit
+            for streamed in range(0, 2 * half + 1, unit):
+                left = min(streamed, half)
+                streaming = Streaming(left, streamed - left, unit, slots)
+                if self._shared_bytes(streaming) <= SHARED_MEMORY:
+                    found.append(streaming)
+                    break
+        whole = [s for s in found if s.left + s.right <= s.unit * s.slots]
+        return (*whole, *found, None)[0]
 
     def _shared_bytes(self, streaming: "Streaming") -> int:
         inputs, hidden = chunks(self.input_size), chunks(self.width)
         right = self.width - self.left
-        streamed = streaming.left * self.left + streaming.right * right
-        columns = inputs * self.width + hidden * 2 * self.head + streamed
-        hidden_layers = len(self.hidden_sizes) - 1
-        columns += hidden_layers * (hidden * self.width - streamed)
+        columns = inputs * self.width + hidden * 2 * self.head
+        columns += (len(self.hidden_sizes) - 1) * (
+            (hidden - streaming.left) * self.left + (hidden - streaming.right) * right
+        )
+        columns += streaming.slots * streaming.unit * self.left
         obs_words = round_up(self.obs_size, 4) // 4
         numbers = 2 * round_up(self.input_size, 4) + 16 * obs_words
         row = 4 * 2 * 4 * (obs_words | 1)  # state and target
         row += 2 * (DEPTH * inputs + 8) + 8  # inputs and offsets
-        activations = 2 * (DEPTH * hidden + 8)
-        tile, of_slice = _TILE * row, _SLICE * (row + activations)
-        return 2 * DEPTH * columns + 4 * numbers + tile + max(tile, of_slice) + 256
+        other = max(_TILE * row, _SLICE * (row + 2 * (DEPTH * hidden + 8)))
+        # And barriers.
+        return 2 * DEPTH * columns + 4 * numbers + _TILE * row + other + 512
 
     def products(self) -> str:
         """Returns the tensor core instructions of the two widths as C++."""

@@ -12,17 +12,19 @@ constexpr int WARPGROUP = 128;
 constexpr int CONSUMERS = 2;
 constexpr int THREADS = (CONSUMERS + 1) * WARPGROUP;
 constexpr int NOISE_WARPS = 3;
-// Numbers that stream of a layer: each half has a place of its own for them.
-constexpr int STREAMED_LEFT = LEFT_STREAMED * DEPTH * LEFT;
-constexpr int STREAMED_RIGHT = RIGHT_STREAMED * DEPTH * RIGHT;
+// All that streams of a layer fits into the ring. If not, a slot is needed again before
+// the other consumer has read it, and they cannot take turns.
+constexpr bool FITS = LEFT_STREAMED + RIGHT_STREAMED <= SLOTS * UNIT;
+
+constexpr int SLOT = UNIT * DEPTH * LEFT;  // LEFT >= RIGHT
+
 // Numbers of a layer that stay in shared memory.
 constexpr int RESIDENT_INPUT = INPUT_WEIGHTS;
-constexpr int RESIDENT_HIDDEN = HIDDEN_WEIGHTS - STREAMED_LEFT - STREAMED_RIGHT;
+constexpr int RESIDENT_HIDDEN = (HIDDEN_CHUNKS - LEFT_STREAMED) * DEPTH * LEFT +
+                                (HIDDEN_CHUNKS - RIGHT_STREAMED) * DEPTH * RIGHT;
 constexpr int RESIDENT_OUTPUT = OUTPUT_WEIGHTS;
 constexpr int RESIDENT_WEIGHTS =
     RESIDENT_INPUT + (LAYERS - 1) * RESIDENT_HIDDEN + RESIDENT_OUTPUT;
-
-enum Half { LEFT_HALF, RIGHT_HALF };  // of a hidden layer's columns
 
 // The particles of one consumer.
 template <int COUNT>
@@ -33,7 +35,11 @@ struct Rows {
   int path_offset[COUNT], action_offset[COUNT];  // of each row
 };
 
-// Of a block: those of two tiles, or of one and a slice.
+// Of a row of activations in shared memory: an odd number of 16 byte words, for 8 rows to
+// be read at once.
+constexpr int ACTIVATION_STRIDE = HIDDEN_CHUNKS * DEPTH + 8;
+
+// Of a block: those of two tiles, or of one and, where the second would be, of a slice.
 union BlockRows {
   Rows<TILE> tiles[CONSUMERS];
   struct {
@@ -44,12 +50,11 @@ union BlockRows {
 };
 
 struct alignas(128) Shared {
-  __half resident[RESIDENT_WEIGHTS > 0 ? RESIDENT_WEIGHTS : 8];
-  __half streamed_left[STREAMED_LEFT > 0 ? STREAMED_LEFT : 8];
-  __half streamed_right[STREAMED_RIGHT > 0 ? STREAMED_RIGHT : 8];
+  __half resident[RESIDENT_WEIGHTS];
+  __half ring[SLOTS][SLOT];
   alignas(16) float shared[SHARED_NUMBERS];
   alignas(16) BlockRows rows;
-  alignas(8) uint64_t resident_full, streamed_full[2], streamed_empty[2];  // of a Half
+  uint64_t resident_full, ring_full[SLOTS], ring_empty[SLOTS];
   uint64_t noise_full[CONSUMERS], noise_empty[CONSUMERS];
 };
 
@@ -65,21 +70,21 @@ __device__ __forceinline__ void sync_warpgroup(int warpgroup) {
   asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory");
 }
 
-// The consumers take turns at the tensor cores. Those that shared them would also finish
-// together, and leave them idle together.
-__device__ __forceinline__ void begin_turn(int consumer) {
-  asm volatile("bar.sync %0, 256;" ::"r"(CONSUMERS + 1 + consumer) : "memory");
-}
+// A position in the ring: which slot, and how often the ring has been around.
+struct Cursor {
+  int slot = 0;
+  uint32_t round = 0;
+  __device__ __forceinline__ void advance() {
+    if (++slot == SLOTS) slot = 0, round ^= 1;
+  }
+};
 
-__device__ __forceinline__ void pass_turn(int consumer) {
-  asm volatile("bar.arrive %0, 256;" ::"r"(2 * CONSUMERS - consumer) : "memory");
-}
-
-// A warp is done with what a barrier tells of. No branch, for use between products.
-__device__ __forceinline__ void release(uint64_t* barrier) {
+// No branch, for use between products.
+__device__ __forceinline__ void release(Shared& smem, int slot) {
   asm volatile(
       "{\n.reg .pred first;\nsetp.eq.u32 first, %1, 0;\n"
-      "@first mbarrier.arrive.shared::cta.b64 _, [%0];\n}" ::"r"(address(barrier)),
+      "@first mbarrier.arrive.shared::cta.b64 _, [%0];\n}" ::"r"(
+          address(&smem.ring_empty[slot])),
       "r"(threadIdx.x % 32)
       : "memory");
 }

@@ -6,8 +6,8 @@
 // their activation, are the left operand of the next layer's products, and only weights come
 // from shared memory. While one warpgroup rounds and squashes, the other keeps the tensor
 // cores busy. A member's weights do not fit into shared memory: as many chunks as do stay
-// there, the others stream from L2, every step anew. The producer warpgroup feeds them and
-// draws the noise.
+// there, the others stream from L2 through a ring, every step anew. The producer warpgroup
+// feeds the ring and draws the noise.
 //
 // Operands are float16: as fast as bfloat16, with three more bits. Sums, the head, the
 // state and its update are float32.
@@ -30,16 +30,16 @@ __host__ __device__ __forceinline__ int blocks_of_member(const Rollout& rollout,
   return (rollout.num_candidates * rollout.particles + rows - 1) / rows;
 }
 
-// Two tiles together take longer than one with a slice, and that longer than one. So
-// blocks have a slice if all of them then find a multiprocessor at once, and did not with
-// one tile. Of two tiles the blocks that are left for a last, partial wave are cut if the
-// multiprocessors have room for twice as many.
+// A tile alone takes less time than one with a slice, and that less than two. So blocks are
+// the smallest of which all find a multiprocessor at once. If none are, they have two
+// tiles, and those that are left for a last, partial wave are cut if the multiprocessors
+// have room for twice as many.
 Split split_up(const Rollout& rollout, int multiprocessors) {
   const int members = rollout.num_members * rollout.batch;
-  const int sliced = members * blocks_of_member(rollout, TILE + SLICE);
-  const int tiles = members * blocks_of_member(rollout, TILE);
-  if (sliced <= multiprocessors && multiprocessors < tiles)
-    return {TILE + SLICE, sliced, 0};
+  for (const int rows : {TILE, TILE + SLICE}) {
+    const int blocks = members * blocks_of_member(rollout, rows);
+    if (blocks <= multiprocessors) return {rows, blocks, 0};
+  }
   const int blocks = members * blocks_of_member(rollout, 2 * TILE);
   const int left = blocks % multiprocessors;
   const int halved = 2 * left <= multiprocessors ? left : 0;
@@ -55,37 +55,24 @@ __device__ __forceinline__ Block find_block(const Rollout& rollout, const Split&
   const int of_batch = blocks * rollout.num_members;
   const int first_row = index % blocks * split.rows + (is_half ? half % 2 * TILE : 0);
   const int rows = rollout.num_candidates * rollout.particles - first_row;
-  const bool is_more = rows > TILE && !is_half, is_sliced = split.rows < 2 * TILE;
-  const int tiles = rows <= 0 ? 0 : is_more && !is_sliced ? 2 : 1;
+  const bool is_more = rows > TILE && !is_half;
+  const int tiles = rows <= 0 ? 0 : is_more && split.rows == 2 * TILE ? 2 : 1;
   return {index / of_batch, index % of_batch / blocks, first_row, tiles,
-          is_more && is_sliced};
+          is_more && split.rows == TILE + SLICE};
 }
 
-// Begins to feed what streams of half a layer: its first chunks.
-template <Half HALF>
-__device__ __forceinline__ void feed(Shared& smem, const uint16_t* weights,
-                                     uint32_t round) {
-  constexpr int SIZE = (HALF == LEFT_HALF ? STREAMED_LEFT : STREAMED_RIGHT) * 2;
-  if constexpr (SIZE > 0) {
-    wait(&smem.streamed_empty[HALF], round ^ 1);
-    expect(&smem.streamed_full[HALF], SIZE);
-    copy(HALF == LEFT_HALF ? smem.streamed_left : smem.streamed_right, weights, SIZE,
-         &smem.streamed_full[HALF]);
+// Feeds what streams of a layer, or half of one: its last chunks, a unit at a time.
+template <int CHUNKS, int COLUMNS, int STREAMED>
+__device__ __forceinline__ void feed(Shared& smem, Cursor& cursor,
+                                     const uint16_t* weights) {
+  constexpr int CHUNK = DEPTH * COLUMNS;
+  for (int chunk = CHUNKS - STREAMED; chunk < CHUNKS; chunk += UNIT) {
+    wait(&smem.ring_empty[cursor.slot], cursor.round ^ 1);
+    expect(&smem.ring_full[cursor.slot], UNIT * CHUNK * 2);
+    copy(smem.ring[cursor.slot], weights + chunk * CHUNK, UNIT * CHUNK * 2,
+         &smem.ring_full[cursor.slot]);
+    cursor.advance();
   }
-}
-
-// Tiles wait for their right half between products, where nvcc takes no branch: it would
-// run no two products at once. So the warp that feeds waits in their place, and meets them.
-__device__ __forceinline__ void meet_feeder(int consumer) {
-  asm volatile("bar.sync %0, 160;" ::"r"(2 * CONSUMERS + 1 + consumer) : "memory");
-}
-
-__device__ __forceinline__ void meet_tiles(Shared& smem, int tiles, uint32_t round) {
-  if (RIGHT_STREAMED == 0) return;
-  wait(&smem.streamed_full[RIGHT_HALF], round);
-  __syncwarp();
-  for (int consumer = 0; consumer < tiles; ++consumer)
-    asm volatile("bar.arrive %0, 160;" ::"r"(2 * CONSUMERS + 1 + consumer) : "memory");
 }
 
 // Loads what stays, and returns where the next goes.
@@ -93,40 +80,32 @@ template <int CHUNKS, int COLUMNS, int STREAMED>
 __device__ __forceinline__ __half* load_residents(Shared& smem, __half* to,
                                                   const uint16_t* weights) {
   constexpr int SIZE = (CHUNKS - STREAMED) * DEPTH * COLUMNS;
-  const uint16_t* const from = weights + STREAMED * DEPTH * COLUMNS;
-  if (SIZE > 0) copy(to, from, SIZE * 2, &smem.resident_full);
+  if (SIZE > 0) copy(to, weights, SIZE * 2, &smem.resident_full);
   return to + SIZE;
 }
 
-__device__ void feed_weights(Shared& smem, const uint16_t* weights, int horizon,
-                             int tiles, int lane) {
+__device__ void feed_weights(Shared& smem, const uint16_t* weights, int horizon) {
   constexpr int LEFT_WEIGHTS = HIDDEN_CHUNKS * DEPTH * LEFT;
   constexpr int INPUT_LEFT = INPUT_CHUNKS * DEPTH * LEFT;
   const uint16_t* hidden = weights + INPUT_WEIGHTS;
   const uint16_t* output = hidden + (LAYERS - 1) * HIDDEN_WEIGHTS;
-  if (lane == 0) {
-    __half* to = smem.resident;
-    expect(&smem.resident_full, RESIDENT_WEIGHTS * 2);
-    to = load_residents<INPUT_CHUNKS, LEFT, 0>(smem, to, weights);
-    to = load_residents<INPUT_CHUNKS, RIGHT, 0>(smem, to, weights + INPUT_LEFT);
-    for (int layer = 0; layer < LAYERS - 1; ++layer) {
-      const uint16_t* from = hidden + layer * HIDDEN_WEIGHTS;
-      to = load_residents<HIDDEN_CHUNKS, LEFT, LEFT_STREAMED>(smem, to, from);
-      to = load_residents<HIDDEN_CHUNKS, RIGHT, RIGHT_STREAMED>(smem, to,
-                                                                from + LEFT_WEIGHTS);
-    }
-    load_residents<HIDDEN_CHUNKS, 2 * HEAD, 0>(smem, to, output);
+  __half* to = smem.resident;
+  expect(&smem.resident_full, RESIDENT_WEIGHTS * 2);
+  to = load_residents<INPUT_CHUNKS, LEFT, 0>(smem, to, weights);
+  to = load_residents<INPUT_CHUNKS, RIGHT, 0>(smem, to, weights + INPUT_LEFT);
+  for (int layer = 0; layer < LAYERS - 1; ++layer) {
+    const uint16_t* from = hidden + layer * HIDDEN_WEIGHTS;
+    to = load_residents<HIDDEN_CHUNKS, LEFT, LEFT_STREAMED>(smem, to, from);
+    to = load_residents<HIDDEN_CHUNKS, RIGHT, RIGHT_STREAMED>(smem, to,
+                                                              from + LEFT_WEIGHTS);
   }
-  uint32_t round = 0;
+  load_residents<HIDDEN_CHUNKS, 2 * HEAD, 0>(smem, to, output);
+  Cursor cursor;
   for (int step = 0; step < horizon; ++step) {
     for (int layer = 0; layer < LAYERS - 1; ++layer) {
       const uint16_t* from = hidden + layer * HIDDEN_WEIGHTS;
-      if (lane == 0) {
-        feed<LEFT_HALF>(smem, from, round);
-        feed<RIGHT_HALF>(smem, from + LEFT_WEIGHTS, round);
-      }
-      meet_tiles(smem, tiles, round);
-      round ^= 1;
+      feed<HIDDEN_CHUNKS, LEFT, LEFT_STREAMED>(smem, cursor, from);
+      feed<HIDDEN_CHUNKS, RIGHT, RIGHT_STREAMED>(smem, cursor, from + LEFT_WEIGHTS);
     }
   }
 }
@@ -154,27 +133,53 @@ __device__ void feed_noise(Shared& smem, const Rollout& rollout, const Block& bl
   }
 }
 
-// Starts sums = activations x weights: the first chunks, which have streamed, and those
-// that stay. Each is a group of products in flight, if there are any.
-template <int CHUNKS, int COLUMNS, int STREAMED, int REGISTERS>
-__device__ __forceinline__ void multiply(float (&sums)[COLUMNS / 2],
-                                         const uint32_t (&activations)[REGISTERS],
-                                         const __half* streamed, const __half* resident) {
-  constexpr int STRIDE = DEPTH * COLUMNS * 2 / 16;  // in units of descriptors
-  uint64_t weights = weight_descriptor(address(STREAMED > 0 ? streamed : resident));
+// Starts sums = activations x weights, as groups of products in flight. A slot of the
+// ring, or one left PENDING from before, is handed back when the unit after it has been
+// started: whoever waits for a slot holds only one. Returns the last slot, which the
+// caller hands back, if any chunk streams.
+template <int CHUNKS, int COLUMNS, int STREAMED, bool PENDING, int REGISTERS>
+__device__ __forceinline__ int multiply(float (&sums)[COLUMNS / 2],
+                                        const uint32_t (&activations)[REGISTERS],
+                                        const __half* resident, Shared& smem,
+                                        Cursor& cursor, int pending = 0) {
+  constexpr int RESIDENT = CHUNKS - STREAMED;
+  constexpr int CHUNK_STRIDE = DEPTH * COLUMNS * 2 / 16;  // in units of descriptors
+  uint64_t weights = weight_descriptor(address(resident));
+  if constexpr (FITS) {
+    // Now, not between the products: nvcc runs no two of them at once around a branch.
+    Cursor ahead = cursor;
+#pragma unroll
+    for (int unit = 0; unit < STREAMED / UNIT; ++unit) {
+      wait(&smem.ring_full[ahead.slot], ahead.round);
+      ahead.advance();
+    }
+  }
   wgmma_fence();
 #pragma unroll
   for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-    if (STREAMED > 0 && chunk == STREAMED) {
-      wgmma_commit();
-      weights = weight_descriptor(address(resident));
+    const bool streamed = chunk >= RESIDENT;
+    const int in_unit = (chunk - RESIDENT) % UNIT;
+    if (streamed && in_unit == 0) {
+      if constexpr (!FITS) wait(&smem.ring_full[cursor.slot], cursor.round);
+      weights = weight_descriptor(address(smem.ring[cursor.slot]));
+      if constexpr (!FITS) wgmma_fence();
     }
     const uint32_t* a = activations + 4 * chunk;
-    Wgmma<COLUMNS>::multiply(
-        sums, a[0], a[1], a[2], a[3],
-        weights + (chunk < STREAMED ? chunk : chunk - STREAMED) * STRIDE, chunk > 0);
+    Wgmma<COLUMNS>::multiply(sums, a[0], a[1], a[2], a[3],
+                             weights + (streamed ? in_unit : chunk) * CHUNK_STRIDE,
+                             chunk > 0);
+    if (chunk + 1 == RESIDENT) wgmma_commit();
+    if (streamed && in_unit + 1 == UNIT) {
+      wgmma_commit();
+      if (PENDING || chunk >= RESIDENT + UNIT) {
+        wgmma_wait<1>();
+        release(smem, pending);
+      }
+      pending = cursor.slot;
+      cursor.advance();
+    }
   }
-  wgmma_commit();
+  return pending;
 }
 
 // Waits for all but the last IN_FLIGHT groups of products.
@@ -189,43 +194,44 @@ __device__ __forceinline__ void finish(float (&sums)[REGISTERS]) {
 // take: left alone it first waits for them, and then does what could have been done.
 __device__ __forceinline__ void keep_order() { asm volatile("pmevent 0;" ::: "memory"); }
 
+// The consumers take turns at the tensor cores. Those that shared them would also finish
+// together, and leave them idle together.
+template <int TILES>
+__device__ __forceinline__ void begin_turn(int consumer) {
+  if constexpr (FITS && TILES == 2)
+    asm volatile("bar.sync %0, 256;" ::"r"(CONSUMERS + 1 + consumer) : "memory");
+}
+
+template <int TILES>
+__device__ __forceinline__ void pass_turn(int consumer) {
+  if constexpr (FITS && TILES == 2)
+    asm volatile("bar.arrive %0, 256;" ::"r"(2 * CONSUMERS - consumer) : "memory");
+}
+
 // One hidden layer. While the right half of its products runs, the left half goes
 // through their activation.
 template <int TILES, int CHUNKS, int LEFT_STREAMED, int RIGHT_STREAMED, int REGISTERS>
 __device__ __forceinline__ void hidden_layer(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
                                              const uint32_t (&operand)[REGISTERS],
                                              const __half* resident, Shared& smem,
-                                             uint32_t round, int pair, int consumer) {
+                                             Cursor& cursor, int pair, int consumer) {
   constexpr int RESIDENT_LEFT = (CHUNKS - LEFT_STREAMED) * DEPTH * LEFT;
-  // Whether a half has products that read what streams, and others behind them.
-  constexpr bool LEFT_BOTH = LEFT_STREAMED > 0 && LEFT_STREAMED < CHUNKS;
-  constexpr bool RIGHT_BOTH = RIGHT_STREAMED > 0 && RIGHT_STREAMED < CHUNKS;
   float left[LEFT / 2], right[RIGHT / 2];
-  if (TILES == 2) begin_turn(consumer);
-  if (LEFT_STREAMED > 0) wait(&smem.streamed_full[LEFT_HALF], round);
-  multiply<CHUNKS, LEFT, LEFT_STREAMED>(left, operand, smem.streamed_left, resident);
-  if (LEFT_BOTH) {
-    wgmma_wait<1>();
-    release(&smem.streamed_empty[LEFT_HALF]);
-  }
-  if (RIGHT_STREAMED > 0) meet_feeder(consumer);
-  multiply<CHUNKS, RIGHT, RIGHT_STREAMED>(right, operand, smem.streamed_right,
-                                          resident + RESIDENT_LEFT);
-  if (TILES == 2) pass_turn(consumer);
-  finish<(RIGHT_BOTH ? 2 : 1)>(left);
-  if (LEFT_STREAMED == CHUNKS) release(&smem.streamed_empty[LEFT_HALF]);
+  begin_turn<TILES>(consumer);
+  const int left_slot =
+      multiply<CHUNKS, LEFT, LEFT_STREAMED, false>(left, operand, resident, smem, cursor);
+  const int right_slot = multiply<CHUNKS, RIGHT, RIGHT_STREAMED, (LEFT_STREAMED > 0)>(
+      right, operand, resident + RESIDENT_LEFT, smem, cursor, left_slot);
+  pass_turn<TILES>(consumer);
+  finish<1>(left);
+  if (LEFT_STREAMED > 0 && RIGHT_STREAMED == 0) release(smem, left_slot);
   activate(left);
   keep_order();
-  if (RIGHT_BOTH) {
-    wgmma_wait<1>();
-    release(&smem.streamed_empty[RIGHT_HALF]);
-  }
   finish<0>(right);
-  if (RIGHT_STREAMED == CHUNKS) release(&smem.streamed_empty[RIGHT_HALF]);
+  if (RIGHT_STREAMED > 0) release(smem, right_slot);
   activate(right);
-  // Rounding waits until here, since no register that a product reads may be written while
-  // another product runs.
-  // Sums lie in registers as activations do.
+  // Sums lie in registers as activations do. Rounding waits until here, since no register
+  // that a product reads may be written while another product runs.
 #pragma unroll
   for (int i = 0; i < LEFT / 4; ++i)
     activations[i] = pack(left[2 * i], left[2 * i + 1]);
@@ -252,9 +258,9 @@ __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block
   warp.begin(block.member, block.first_row + consumer * TILE + own);
   sync_warpgroup(consumer);
   wait(&smem.resident_full, 0);
-  if (consumer == 1) pass_turn(consumer);  // the other one is first
+  if (consumer == 1) pass_turn<TILES>(consumer);  // the other one is first
 
-  uint32_t round = 0;
+  Cursor cursor;
   for (int step = 0; step < rollout.horizon; ++step) {
     warp.load_actions(min(step + 1, rollout.horizon - 1));
     float head[HEAD];
@@ -262,16 +268,16 @@ __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block
       uint32_t activations[4 * HIDDEN_CHUNKS], operand[4 * INPUT_CHUNKS];
       warp.read_inputs(operand);
       hidden_layer<TILES, INPUT_CHUNKS, 0, 0>(activations, operand, smem.resident, smem,
-                                              round, pair, consumer);
+                                              cursor, pair, consumer);
       const __half* resident = smem.resident + RESIDENT_INPUT;
 #pragma unroll 1
       for (int layer = 1; layer < LAYERS; ++layer) {
         hidden_layer<TILES, HIDDEN_CHUNKS, LEFT_STREAMED, RIGHT_STREAMED>(
-            activations, activations, resident, smem, round, pair, consumer);
+            activations, activations, resident, smem, cursor, pair, consumer);
         resident += RESIDENT_HIDDEN;
-        round ^= 1;
       }
-      multiply<HIDDEN_CHUNKS, 2 * HEAD, 0>(head, activations, nullptr, resident);
+      multiply<HIDDEN_CHUNKS, 2 * HEAD, 0, false>(head, activations, resident, smem,
+                                                  cursor);
       warp.write_actions();
       warp.store_states(step);
       keep_order();
@@ -295,9 +301,9 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
   const uint16_t* weights = rollout.weights + int64_t(block.member) * MEMBER_WEIGHTS;
   if (threadIdx.x == 0) {
     init_barrier(&smem.resident_full, 1);
-    for (int half = LEFT_HALF; half <= RIGHT_HALF; ++half) {
-      init_barrier(&smem.streamed_full[half], 1);
-      init_barrier(&smem.streamed_empty[half], block.consumers() * WARPGROUP / 32);
+    for (int slot = 0; slot < SLOTS; ++slot) {
+      init_barrier(&smem.ring_full[slot], 1);
+      init_barrier(&smem.ring_empty[slot], block.consumers() * WARPGROUP / 32);
     }
     for (int consumer = 0; consumer < CONSUMERS; ++consumer) {
       init_barrier(&smem.noise_full[consumer], NOISE_WARPS);
@@ -314,8 +320,8 @@ __global__ __launch_bounds__(THREADS, 1) void rollout_kernel(
     asm volatile("setmaxnreg.dec.sync.aligned.u32 56;");
     if (thread >= 32)
       feed_noise(smem, rollout, block, thread - 32);
-    else
-      feed_weights(smem, weights, rollout.horizon, block.tiles, thread);
+    else if (thread == 0)
+      feed_weights(smem, weights, rollout.horizon);
   } else {
     asm volatile("setmaxnreg.inc.sync.aligned.u32 224;");
     if (block.tiles == 2)

@@ -18,8 +18,8 @@ __host__ __device__ constexpr int eights_of_warp(int columns) {
   return (columns / 8 + SLICE_WARPS - 1) / SLICE_WARPS;
 }
 
-// Reads 16 deep x 8 columns as right operands, of two times 8 columns or of one. Each of
-// 16 lanes has the address of 8 deep x 1 column.
+// Reads 16 deep x 8 columns as a right operand, or two of these. Each of 16 lanes has the
+// address of 8 deep x 1 column, for the second one each of the 16 others.
 __device__ __forceinline__ void load_weights(uint32_t (&b)[4], uint32_t from, bool two) {
   if (two)
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
@@ -31,6 +31,12 @@ __device__ __forceinline__ void load_weights(uint32_t (&b)[4], uint32_t from, bo
                  : "=r"(b[0]), "=r"(b[1])
                  : "r"(from)
                  : "memory");
+}
+
+// Hands a slot back. An arrival may overtake what the warp has asked for and not yet read,
+// and a copy would overwrite that. So its place seems to depend on a word of every read.
+__device__ __forceinline__ void release_read(Shared& smem, int slot, uint32_t words) {
+  release(smem, slot + (words & (gridDim.y - 1)));  // that is 0
 }
 
 // The slice's rows of an operand, all chunks of it.
@@ -46,51 +52,53 @@ struct SliceOperand {
   }
 };
 
-// A warp's part of a product: EIGHTS times 8 of COLUMNS columns, `first` and every
+// sums = operand x weights, of EIGHTS times 8 of COLUMNS columns: `first` and every
 // `stride`-th after it. Beyond the last column the last are multiplied again, for nobody.
-template <int COLUMNS, int STREAMED, int EIGHTS>
-struct SlicePart {
-  static constexpr int CHUNK = DEPTH * COLUMNS * 2;  // bytes
-  uint32_t streamed[(EIGHTS + 1) / 2], resident[(EIGHTS + 1) / 2];  // of two times 8 columns
-  float sums[EIGHTS][4];
-
-  __device__ __forceinline__ SlicePart(const __half* from, const __half* stays, int first,
-                                       int stride, int lane) {
+template <int COLUMNS, int STREAMED, int EIGHTS, int CHUNKS>
+__device__ __forceinline__ void multiply(float (&sums)[EIGHTS][4],
+                                         const SliceOperand<CHUNKS>& operand,
+                                         const __half* resident, Shared& smem,
+                                         Cursor& cursor, int first, int stride, int lane) {
+  constexpr int RESIDENT = CHUNKS - STREAMED, CHUNK = DEPTH * COLUMNS * 2;  // bytes
+  uint32_t places[(EIGHTS + 1) / 2];  // of two times 8 columns: in a chunk
+#pragma unroll
+  for (int i = 0; i < EIGHTS; i += 2) {
+    const int eight = min(first + (i + lane / 16) * stride, COLUMNS / 8 - 1);
+    places[i / 2] = (eight * EIGHT + lane % 16 * 8) * 2;
+  }
+#pragma unroll
+  for (int i = 0; i < EIGHTS; ++i)
+#pragma unroll
+    for (int k = 0; k < 4; ++k) sums[i][k] = 0.0f;
+  uint32_t from = address(resident), read = 0, pending_read = 0;
+  int pending = 0;
+#pragma unroll
+  for (int chunk = 0; chunk < CHUNKS; ++chunk) {
+    const bool streamed = chunk >= RESIDENT;
+    const int in_unit = (chunk - RESIDENT) % UNIT;
+    if (streamed && in_unit == 0) {
+      wait(&smem.ring_full[cursor.slot], cursor.round);
+      from = address(smem.ring[cursor.slot]);
+    }
 #pragma unroll
     for (int i = 0; i < EIGHTS; i += 2) {
-      const int eight = min(first + (i + lane / 16) * stride, COLUMNS / 8 - 1);
-      const int place = eight * EIGHT + lane % 16 * 8;
-      streamed[i / 2] = address(from + place);
-      resident[i / 2] = address(stays + place) - STREAMED * CHUNK;
+      uint32_t b[4];
+      load_weights(b, from + (streamed ? in_unit : chunk) * CHUNK + places[i / 2],
+                   i + 1 < EIGHTS);
+      add_product(sums[i], operand.words[chunk], b);
+      if (i + 1 < EIGHTS) add_product(sums[i + 1], operand.words[chunk], b + 2);
+      if (streamed) read |= b[0];
     }
-#pragma unroll
-    for (int i = 0; i < EIGHTS; ++i)
-#pragma unroll
-      for (int k = 0; k < 4; ++k) sums[i][k] = 0.0f;
-  }
-
-  template <int CHUNKS>
-  __device__ __forceinline__ void multiply(const SliceOperand<CHUNKS>& operand,
-                                           Shared& smem, Half half, uint32_t round) {
-    if (STREAMED > 0) wait(&smem.streamed_full[half], round);
-    uint32_t read = 0;
-#pragma unroll
-    for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-#pragma unroll
-      for (int i = 0; i < EIGHTS; i += 2) {
-        uint32_t b[4];
-        const uint32_t from = chunk < STREAMED ? streamed[i / 2] : resident[i / 2];
-        load_weights(b, from + chunk * CHUNK, i + 1 < EIGHTS);
-        add_product(sums[i], operand.words[chunk], b);
-        if (i + 1 < EIGHTS) add_product(sums[i + 1], operand.words[chunk], b + 2);
-        if (chunk < STREAMED) read |= b[0];
-      }
+    if (streamed && in_unit + 1 == UNIT) {
+      // A slot is handed back when the unit after it has been read, or none comes.
+      if (chunk >= RESIDENT + UNIT) release_read(smem, pending, pending_read);
+      pending = cursor.slot;
+      pending_read = read;
+      cursor.advance();
     }
-    // An arrival may overtake what the warp has yet to read, and then a copy overwrites that.
-    // So its place seems to depend on all that was read. gridDim.y is 1.
-    if (STREAMED > 0) release(smem.streamed_empty + half + (read & (gridDim.y - 1)));
   }
-};
+  if (STREAMED > 0) release_read(smem, pending, pending_read);
+}
 
 // Squashes a warp's sums of half a layer, and rounds them.
 template <int EIGHTS>
@@ -130,18 +138,17 @@ template <int CHUNKS, int LEFT_STREAMED, int RIGHT_STREAMED>
 __device__ __forceinline__ void slice_layer(__half* activations,
                                             const SliceOperand<CHUNKS>& operand,
                                             const __half* resident, Shared& smem,
-                                            uint32_t round, int warp, int lane) {
+                                            Cursor& cursor, int warp, int lane) {
+  constexpr int RESIDENT_LEFT = (CHUNKS - LEFT_STREAMED) * DEPTH * LEFT;
   constexpr int LEFTS = eights_of_warp(LEFT), RIGHTS = eights_of_warp(RIGHT);
-  SlicePart<LEFT, LEFT_STREAMED, LEFTS> left(smem.streamed_left, resident, warp,
-                                             SLICE_WARPS, lane);
-  resident += (CHUNKS - LEFT_STREAMED) * DEPTH * LEFT;
-  SlicePart<RIGHT, RIGHT_STREAMED, RIGHTS> right(smem.streamed_right, resident, warp,
-                                                 SLICE_WARPS, lane);
+  float left[LEFTS][4], right[RIGHTS][4];
   uint32_t left_rounded[LEFTS][2], right_rounded[RIGHTS][2];
-  left.multiply(operand, smem, LEFT_HALF, round);
-  squash(left_rounded, left.sums);
-  right.multiply(operand, smem, RIGHT_HALF, round);
-  squash(right_rounded, right.sums);
+  multiply<LEFT, LEFT_STREAMED>(left, operand, resident, smem, cursor, warp, SLICE_WARPS,
+                                lane);
+  squash(left_rounded, left);
+  multiply<RIGHT, RIGHT_STREAMED>(right, operand, resident + RESIDENT_LEFT, smem, cursor,
+                                  warp, SLICE_WARPS, lane);
+  squash(right_rounded, right);
   sync_slice();
   write<LEFT>(activations, left_rounded, warp, lane);
   write<RIGHT>(activations + LEFT, right_rounded, warp, lane);
@@ -171,7 +178,7 @@ __device__ void consume_slice(Shared& smem, const Rollout& rollout, const Block&
   sync_slice();
   wait(&smem.resident_full, 0);
 
-  uint32_t round = 0;
+  Cursor cursor;
   for (int step = 0; step < rollout.horizon; ++step) {
     if (warp == CLERK) {
       particles.store_states(step);
@@ -180,7 +187,7 @@ __device__ void consume_slice(Shared& smem, const Rollout& rollout, const Block&
     const __half* resident = smem.resident;
     slice_layer<INPUT_CHUNKS, 0, 0>(
         activations, SliceOperand<INPUT_CHUNKS>(rows.inputs, INPUT_STRIDE, lane), resident,
-        smem, round, warp, lane);
+        smem, cursor, warp, lane);
     if (warp == CLERK) particles.write_actions();
     sync_slice();
     resident += RESIDENT_INPUT;
@@ -188,10 +195,9 @@ __device__ void consume_slice(Shared& smem, const Rollout& rollout, const Block&
     for (int layer = 1; layer < LAYERS; ++layer) {
       slice_layer<HIDDEN_CHUNKS, LEFT_STREAMED, RIGHT_STREAMED>(
           activations, SliceOperand<HIDDEN_CHUNKS>(activations, ACTIVATION_STRIDE, lane),
-          resident, smem, round, warp, lane);
+          resident, smem, cursor, warp, lane);
       sync_slice();
       resident += RESIDENT_HIDDEN;
-      round ^= 1;
     }
     // Of 8 entries a warp has the means and the log-variances.
     if (warp < HEAD / 8) {
@@ -199,9 +205,9 @@ __device__ void consume_slice(Shared& smem, const Rollout& rollout, const Block&
       wait(&smem.noise_full[1], step & 1);
 #pragma unroll
       for (int eight = warp; eight < HEAD / 8; eight += SLICE_WARPS) {
-        SlicePart<2 * HEAD, 0, 2> head(resident, resident, eight, HEAD / 8, lane);
-        head.multiply(operand, smem, LEFT_HALF, round);
-        const float(&drawn)[8] = reinterpret_cast<const float(&)[8]>(head.sums);
+        float head[2][4];
+        multiply<2 * HEAD, 0>(head, operand, resident, smem, cursor, eight, HEAD / 8, lane);
+        const float(&drawn)[8] = reinterpret_cast<const float(&)[8]>(head);
         draw_targets(rows.target + 8 * eight + lane / 4 * STATE_STRIDE, drawn,
                      smem.shared + 8 * eight, lane % 4, OBS - 8 * eight);
       }

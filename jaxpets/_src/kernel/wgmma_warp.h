@@ -1,4 +1,4 @@
-// A warp's 16 particles whose activations stay in registers, for wgmma_rollout.cu.
+// A warp's 16 particles, for wgmma_rollout.cu.
 #pragma once
 
 #include "gpu_particles.h"
@@ -6,9 +6,7 @@
 namespace {
 
 constexpr int ROWS = 16;
-// Odd numbers of 16 byte words, for 8 rows to be read at once.
 constexpr int INPUT_STRIDE = INPUT_CHUNKS * DEPTH + 8;
-constexpr int ACTIVATION_STRIDE = HIDDEN_CHUNKS * DEPTH + 8;
 
 // Behind the last activation stand two ones, for the rows that hold the biases.
 __device__ __forceinline__ void append_ones(uint32_t (&activations)[4 * HIDDEN_CHUNKS],
