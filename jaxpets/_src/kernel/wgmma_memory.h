@@ -58,6 +58,21 @@ struct alignas(128) Shared {
   uint64_t noise_full[CONSUMERS], noise_empty[CONSUMERS];
 };
 
+// A warp that has a consumer's rows from `first` on.
+template <int COUNT>
+__device__ __forceinline__ Warp warp_of(Rows<COUNT>& rows, int first, Shared& smem,
+                                        const Rollout& rollout, int lane) {
+  return {rollout,
+          smem.shared,
+          rows.inputs + first * INPUT_STRIDE,
+          rows.state + first * STATE_STRIDE,
+          rows.target + first * STATE_STRIDE,
+          rows.path_offset + first,
+          rows.action_offset + first,
+          lane,
+          rollout.num_members * rollout.particles * OBS};
+}
+
 // What a block owns: of a member the rows from the first on.
 struct Block {
   int batch, member, first_row, tiles;

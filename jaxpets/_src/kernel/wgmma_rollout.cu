@@ -245,16 +245,7 @@ template <int TILES>
 __device__ void consume(Shared& smem, const Rollout& rollout, const Block& block,
                         int consumer, int thread) {
   const int lane = thread % 32, pair = lane % 4, own = thread / 32 * ROWS;
-  Rows<TILE>& rows = smem.rows.tiles[consumer];
-  Warp warp = {rollout,
-               smem.shared,
-               rows.inputs + own * INPUT_STRIDE,
-               rows.state + own * STATE_STRIDE,
-               rows.target + own * STATE_STRIDE,
-               rows.path_offset + own,
-               rows.action_offset + own,
-               lane,
-               rollout.num_members * rollout.particles * OBS};
+  Warp warp = warp_of(smem.rows.tiles[consumer], own, smem, rollout, lane);
   warp.begin(block.member, block.first_row + consumer * TILE + own);
   sync_warpgroup(consumer);
   wait(&smem.resident_full, 0);

@@ -22,10 +22,7 @@ __host__ __device__ constexpr int eights_of_warp(int columns) {
 // address of 8 deep x 1 column, for the second one each of the 16 others.
 __device__ __forceinline__ void load_weights(uint32_t (&b)[4], uint32_t from, bool two) {
   if (two)
-    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
-                 : "=r"(b[0]), "=r"(b[1]), "=r"(b[2]), "=r"(b[3])
-                 : "r"(from)
-                 : "memory");
+    load_operand(b, from);  // as many words
   else
     asm volatile("ldmatrix.sync.aligned.m8n8.x2.shared.b16 {%0, %1}, [%2];"
                  : "=r"(b[0]), "=r"(b[1])
@@ -161,15 +158,7 @@ __device__ void consume_slice(Shared& smem, const Rollout& rollout, const Block&
   __half* const activations = smem.rows.sliced.activations;
   // One warp moves the particles, another one stores them and reads their actions.
   constexpr int MOVER = 0, CLERK = SLICE_WARPS - 1;
-  Warp particles = {rollout,
-                    smem.shared,
-                    rows.inputs,
-                    rows.state,
-                    rows.target,
-                    rows.path_offset,
-                    rows.action_offset,
-                    lane,
-                    rollout.num_members * rollout.particles * OBS};
+  Warp particles = warp_of(rows, 0, smem, rollout, lane);
   if (warp == MOVER) particles.begin(block.member, block.first_row + TILE);
   constexpr int BEHIND = HIDDEN_CHUNKS * DEPTH - WIDTH;
   for (int i = thread; i < SLICE * BEHIND; i += WARPGROUP)
