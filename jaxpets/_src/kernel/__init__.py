@@ -29,11 +29,11 @@ Who includes whom:
     mma_rollout.cu      gpu_layout.h, gpu_launch.h, gpu_particles.h, mma_product.h
     wgmma_slice.h       mma.h, wgmma_memory.h: a few particles that share their columns
     wgmma_memory.h      hopper.h, wgmma_warp.h: what a block shares, who waits for what
-    wgmma_warp.h        gpu_particles.h: what a warp does with its particles
+    wgmma_warp.h        gpu_particles.h: a warp's particles, as Hopper's kernel has them
     hopper.h            gpu_particles.h: barriers, and copies that arrive at them
     mma_product.h       gpu_layout.h, mma.h: what a warp multiplies, and its weights
     gpu_launch.h        xla_call.h: how XLA's call becomes a launch
-    gpu_particles.h     handler.h: the same, for a warp or a block of any size
+    gpu_particles.h     handler.h: what a warp or a block does with its particles
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
     fit_epoch.cu        fit_epoch.h, gpu_launch.h
