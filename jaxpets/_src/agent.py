@@ -11,7 +11,8 @@ from jax import Array
 from jaxpets._src import agent_file
 from jaxpets._src import agent_steps as computed
 from jaxpets._src import agent_world as told
-from jaxpets._src.agent_steps import ActFn, AgentSteps, act_fn, agent_steps
+from jaxpets._src.agent_call import CallFn, compiled, first_state, places
+from jaxpets._src.agent_steps import AgentSteps, Given, act_fn, agent_steps
 from jaxpets._src.agent_world import World, autoreset_of
 from jaxpets._src.checks import check_count, check_functions, check_record
 from jaxpets._src.ensemble import Ensemble, params_check
@@ -121,12 +122,12 @@ class Agent:
         self._learn: computed.LearnFn = jax.jit(steps.learn)
         init_key, self._act_key, self._learn_key = jax.random.split(key, 3)
         self._state: LearnerState = jax.jit(steps.init)(init_key, params)
-        self._places = computed.places(self.params)
+        self._places = places(self.params)
         self._counts = agent_file.Counts(0, 0, 0, trained=int(params is not None))
         self._task: tuple[Planner, Any] | None = None
         self._acting: Planner | None = None  # whose state is `_plan`
         self._plan: Any = ()
-        self._acts: dict[Planner, ActFn] = {}
+        self._acts: dict[Planner, CallFn] = {}
         self._seen = told.memory(cast(LearnerState, self._state).dataset)
         self.reset()
 
@@ -185,16 +186,12 @@ class Agent:
         if planner is not self._acting:
             self._is_new = np.ones(self._world.lead, bool)
             self._acting = planner
-            self._plan = computed.first_state(planner, self._world.lead, self._places)
-        output, self._plan = self._compiled(planner)(
-            self._act_key,
-            np.int32(self._counts.acts),
-            self._is_new,
-            PlanParams(self._state.params, reward),
-            self._plan,
-            seen,
+            self._plan = first_state(planner, self._world.lead, self._places)
+        given = Given(np.int32(self._counts.acts), self._is_new, seen)
+        params = PlanParams(self._state.params, reward)
+        action, self._plan = self._compiled(planner)(
+            params, self._act_key, self._plan, given
         )
-        action = np.array(output)  # waits for it
         self._is_new = np.zeros(self._world.lead, bool)
         self._awaited = seen, action
         self._counts = self._counts._replace(acts=self._counts.acts + 1)
@@ -287,10 +284,10 @@ class Agent:
         self._seen.clear()
         self.reset()
 
-    def _compiled(self, planner: Planner) -> ActFn:
+    def _compiled(self, planner: Planner) -> CallFn:
         if planner not in self._acts:
             step = act_fn(planner, self._steps.action_size, self._world.num_envs)
-            self._acts[planner] = jax.jit(step, out_shardings=self._places)
+            self._acts[planner] = compiled(step, self._places)
         return self._acts[planner]
 
     def _remember(self) -> None:

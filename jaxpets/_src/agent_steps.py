@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxpets._src import dataset as datasets
 from jaxpets._src.checks import check_array
@@ -18,12 +17,25 @@ from jaxpets._src.fit_records import FitMetrics, Fitter
 from jaxpets._src.learner import LearnerState, RewardData, fitted, new_state
 from jaxpets._src.types import Planner, PlanParams, Transition
 
-# `(key, number, is_new, PlanParams, state, obs) -> (action, state)`.
-ActFn = Callable[[Array, Any, Any, PlanParams, Any, Any], tuple[Array, Any]]
 LearnFn = Callable[[Array, LearnerState], tuple[LearnerState, FitMetrics]]
-# Of an action and of a planner's state; None leaves it to JAX.
-Places = tuple[Sharding | None, Sharding | None]
-_APART = ("gpu",)  # platforms whose memory is not the host's
+
+
+class Given(NamedTuple):
+    """What the world gives a step: numbers of the host.
+
+    Attributes:
+      number: `[]` int32, of the step.
+      is_new: `[]` or `[N]`, whether a trial begins.
+      obs: `[D]` or `[N, D]`.
+    """
+
+    number: Any
+    is_new: Any
+    obs: Any
+
+
+# `(PlanParams, key, state, Given) -> (action, state)`.
+ActFn = Callable[[PlanParams, Array, Any, Given], tuple[Array, Any]]
 
 
 class AgentSteps(NamedTuple):
@@ -59,9 +71,8 @@ def agent_steps(
 def act_fn(planner: Planner, action_size: int, num_envs: int | None) -> ActFn:
     """Returns one step of a planner in one world, or in N of them.
 
-    The arguments of what is returned: `key`; `number`, `[]`, of the step, which is
-    folded into it; `is_new`, `[]` or `[N]`, whether a trial begins; PlanParams; the
-    planner's state, `[N, ...]`; `obs`, `[D]` or `[N, D]`.
+    The planner's state is `[N, ...]` then, and the action `[N, A]`. The number of the
+    step is folded into its key.
     """
 
     def one(
@@ -75,50 +86,16 @@ def act_fn(planner: Planner, action_size: int, num_envs: int | None) -> ActFn:
         return output.action, state
 
     def act(
-        key: Array, number: Any, is_new: Any, params: PlanParams, state: Any, obs: Any
+        params: PlanParams, key: Array, state: Any, given: Given
     ) -> tuple[Array, Any]:
-        key = jax.random.fold_in(key, number)
+        key = jax.random.fold_in(key, given.number)
         if num_envs is None:
-            return one(params, key, is_new, state, obs)
+            return one(params, key, given.is_new, state, given.obs)
         keys = jax.random.split(key, num_envs)
         every = jax.vmap(one, (None, 0, 0, 0, 0))
-        return every(params, keys, is_new, state, obs)
+        return every(params, keys, given.is_new, state, given.obs)
 
     return act
-
-
-def places(params: EnsembleParams) -> Places:
-    """Returns where an action and a planner's state go.
-
-    The host waits for an action. A GPU that writes it to pinned memory of the host
-    spares it the copy: see "A plan that is waited for" in benchmarks/README.md.
-
-    Args:
-      params: of the model; it is computed where they are. On a CPU there is nothing to
-        gain. Where there are several devices a planner may use them all, and then its
-        outputs have no one place: JAX decides.
-    """
-    devices = {x for leaf in jax.tree.leaves(params) for x in leaf.devices()}
-    if len(devices) != 1 or jax.local_device_count() != 1:
-        return None, None
-    (device,) = devices
-    kinds = {memory.kind for memory in device.addressable_memories()}
-    if device.platform not in _APART or "pinned_host" not in kinds:
-        return None, None
-    here = SingleDeviceSharding(device)
-    return here.with_memory_kind("pinned_host"), here
-
-
-def first_state(planner: Planner, lead: tuple[int, ...], places: Places) -> Any:
-    """Returns a planner's state with the leading axes of its worlds, in its place.
-
-    A step returns it there; if it began elsewhere, the second step would compile anew.
-    """
-
-    def every(leaf: Any) -> Array:
-        return jnp.broadcast_to(leaf, (*lead, *jnp.shape(leaf)))
-
-    return jax.device_put(jax.tree.map(every, planner.init()), places[1])
 
 
 def strongly_typed(tree: Any) -> Any:

@@ -12,7 +12,7 @@ import toys
 from safetensors.numpy import load_file, save_file
 
 import jaxpets
-from jaxpets._src import agent_steps
+from jaxpets._src import agent_call
 
 ONE = np.ones(1)
 RANDOM = jaxpets.random_planner(-ONE, ONE)
@@ -244,16 +244,16 @@ def test_another_planner_performs(make, trained):
 
 
 @pytest.mark.parametrize("num_envs", [None, 2])
-def test_an_action_comes_in_pinned_memory_of_the_host(
+def test_it_acts_alike_through_pinned_memory_of_the_host(
     make, trained, num_envs, monkeypatch, tmp_path
 ):
     device = jax.devices()[0]
     if "pinned_host" not in {memory.kind for memory in device.addressable_memories()}:
         pytest.skip("this device has no such memory")
     obs = np.full((2,) if num_envs is None else (2, 2), 0.25)
-    monkeypatch.setattr(agent_steps, "_APART", ())
+    monkeypatch.setattr(agent_call, "_APART", ())
     plain = make(num_envs=num_envs, params=trained)
-    monkeypatch.setattr(agent_steps, "_APART", (device.platform,))
+    monkeypatch.setattr(agent_call, "_APART", (device.platform,))
     pinned = make(num_envs=num_envs, params=trained)
     kinds = [place.memory_kind for place in pinned._places]
     assert kinds == ["pinned_host", device.default_memory().kind]
@@ -271,10 +271,10 @@ def test_an_action_comes_in_pinned_memory_of_the_host(
         agent.perform(0.5)
     np.testing.assert_array_equal(pinned.act(obs), plain.act(obs))
     # Its state is in one place from the first step on: the second compiles nothing.
-    assert [act._cache_size() for act in pinned._acts.values()] == [1, 1]
+    assert [act.program._cache_size() for act in pinned._acts.values()] == [1, 1]
 
 
-def test_where_an_action_comes_is_left_to_jax_on_a_cpu_and_on_several_devices():
+def test_memory_is_left_to_jax_on_a_cpu_and_on_several_devices():
     def params(*platforms, kind="pinned_host"):
         """What is on devices that have one kind of memory."""
         memories = {"addressable_memories.return_value": [Mock(kind=kind)]}
@@ -282,7 +282,7 @@ def test_where_an_action_comes_is_left_to_jax_on_a_cpu_and_on_several_devices():
         return Mock(devices=lambda: devices)
 
     for one in (params("cpu"), params("gpu", "gpu"), params("gpu", kind="device")):
-        assert agent_steps.places(one) == (None, None)
+        assert agent_call.places(one) is None
 
 
 def test_what_a_world_may_not_say(make, trained):

@@ -1,0 +1,144 @@
+"""How an agent calls a step: numbers of the host go in, and an action comes back."""
+
+import ctypes
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Sharding, SingleDeviceSharding
+
+from jaxpets._src.agent_steps import ActFn, Given
+from jaxpets._src.ensemble_params import EnsembleParams
+from jaxpets._src.types import Planner, PlanParams
+
+# `(PlanParams, key, state, Given) -> (action, state)`, the action of NumPy.
+CallFn = Callable[[PlanParams, Array, Any, Given], tuple[np.ndarray, Any]]
+_APART = ("gpu",)  # platforms whose memory is not the host's
+_UNSEEN = 0x7FC0DEAD  # a NaN that no arithmetic makes
+
+
+class Places(NamedTuple):
+    """Memory of the host that a device reads and writes, and the device's own."""
+
+    host: Sharding
+    device: Sharding
+
+
+def places(params: EnsembleParams) -> Places | None:
+    """Returns where a step's numbers and its state lie; None leaves it to JAX.
+
+    Args:
+      params: of the model; it is computed where they are. On a CPU there is nothing to
+        gain. Where there are several devices a planner may use them all, and then its
+        outputs have no one place.
+    """
+    devices = {x for leaf in jax.tree.leaves(params) for x in leaf.devices()}
+    if len(devices) != 1 or jax.local_device_count() != 1:
+        return None
+    (device,) = devices
+    kinds = {memory.kind for memory in device.addressable_memories()}
+    if device.platform not in _APART or "pinned_host" not in kinds:
+        return None
+    here = SingleDeviceSharding(device)
+    return Places(here.with_memory_kind("pinned_host"), here)
+
+
+def first_state(planner: Planner, lead: tuple[int, ...], places: Places | None) -> Any:
+    """Returns a planner's state with the leading axes of its worlds, in its place.
+
+    A step returns it there; if it began elsewhere, the second step would compile anew.
+    """
+
+    def every(leaf: Any) -> Array:
+        return jnp.broadcast_to(leaf, (*lead, *jnp.shape(leaf)))
+
+    state = jax.tree.map(every, planner.init())
+    return jax.device_put(state, places.device if places else None)
+
+
+def compiled(act: ActFn, places: Places | None) -> CallFn:
+    """Returns a step that is compiled, and waits for its action."""
+    if places is not None:
+        return Mailbox(act, places)
+    program: Any = jax.jit(act)
+
+    def call(
+        params: PlanParams, key: Array, state: Any, given: Given
+    ) -> tuple[np.ndarray, Any]:
+        action, state = program(params, key, state, given)
+        return np.array(action), state
+
+    return call
+
+
+class Mailbox:
+    """A compiled step whose numbers pass through memory that host and device share.
+
+    XLA takes long to bring a few numbers to a GPU, and to say that a program has ended:
+    see "A plan that is waited for" in benchmarks/README.md. Here the host writes what
+    is given into pinned memory, from where the program reads it. The action comes into
+    an array that each call gives to the next, filled with a NaN of its own, and is
+    there once all of that has been replaced.
+
+    That an action is written once, when it is known, is so where the program has its
+    other numbers elsewhere: of GPUs and not of a CPU, where it may work in that array.
+    """
+
+    def __init__(self, act: ActFn, places: Places) -> None:
+        def program(
+            slot: Array, params: PlanParams, key: Array, state: Any, given: Given
+        ) -> tuple[Array, Any]:
+            del slot  # its memory is the action's
+            given = jax.device_put(given, jax.memory.Space.Device)
+            return act(params, key, state, given)
+
+        self._act, self._host = act, places.host
+        self.program: Any = jax.jit(
+            program, donate_argnums=0, keep_unused=True, out_shardings=tuple(places)
+        )
+        self._given: Any = None  # in that memory, and its views
+        self._slot: Any = None  # likewise; None while it is not known who writes there
+
+    def __call__(
+        self, params: PlanParams, key: Array, state: Any, given: Given
+    ) -> tuple[np.ndarray, Any]:
+        """Returns the action, a copy, and the state, which may not be computed yet."""
+        if self._given is None:
+            self._given = self._shared(given)
+        slot, self._slot = self._slot, None
+        if slot is None:
+            action, _ = jax.eval_shape(self._act, params, key, state, given)
+            slot = self._shared(np.zeros(action.shape, action.dtype))
+        (slot, action), (inputs, views) = slot, self._given
+        slot.block_until_ready()  # the call before has ended, and reads no more
+        for view, value in zip(views, given, strict=True):
+            view[...] = value
+        words = action.reshape(-1).view(np.uint32)
+        words[:] = _UNSEEN
+        slot, state = self.program(slot, params, key, state, inputs)
+        if slot.unsafe_buffer_pointer() != action.ctypes.data:
+            return np.array(slot), state  # XLA has put it elsewhere
+        has_ended = False
+        while (words == _UNSEEN).any():
+            if has_ended:
+                return np.array(slot), state  # raises what has failed
+            has_ended = slot.is_ready()
+            time.sleep(0)  # lets other threads of Python go on
+        self._slot = slot, action
+        return action.copy(), state
+
+    def _shared(self, numbers: Any) -> tuple[Any, Any]:
+        """Returns numbers in that memory, and the same as arrays of NumPy."""
+        arrays: Any = jax.device_put(numbers, self._host)
+        jax.block_until_ready(arrays)
+        return arrays, jax.tree.map(_seen, arrays)
+
+
+def _seen(array: Array) -> np.ndarray:
+    """Returns an array in memory of the host as it is, to be read and written."""
+    memory = (ctypes.c_char * array.nbytes).from_address(array.unsafe_buffer_pointer())
+    return np.frombuffer(memoryview(memory), array.dtype).reshape(array.shape)
