@@ -25,7 +25,7 @@ def places():
 
 
 def given(number, obs=(0.5, 2.0), is_new=False):
-    return Given(np.int32(number), np.bool_(is_new), np.asarray(obs, np.float32))
+    return Given(np.int32(number), np.asarray(is_new), np.asarray(obs, np.float32))
 
 
 def act(params, key, state, given):
@@ -95,15 +95,16 @@ def test_any_number_comes_in_the_end():
         assert np.isnan(action) == (number == 1)
 
 
+@pytest.mark.skipif(DEVICE.platform != "cpu", reason="the runtime refuses there")
 def test_what_xla_puts_elsewhere_is_awaited_there():
     step, kept, held = compiled(act, places()), [], None
     for number in range(3):
         action, _ = step(1.0, KEY, start(), given(number))
         assert action[0] == number + 2.5
         kept.append(step._slot is not None)
-        # Whoever looks at an array of a CPU keeps it from being given away.
+        # Whoever looks at an array keeps it from being given away.
         held = np.asarray(step._slot[0]) if kept[-1] else None
-    assert kept == [True, DEVICE.platform != "cpu", True]
+    assert kept == [True, False, True]
     del held
 
 
@@ -113,18 +114,21 @@ def test_no_action_of_a_gpu_is_seen_before_it_is_known(num_envs):
     """Plans by the kernel, one after the other."""
     model = toys.small_ensemble(precision=jaxpets.Precision.BF16)
     rollout = jaxpets.fused_rollout(model, num_particles=2 * model.num_members)
+    assert rollout.uses_kernel
     planner = jaxpets.plan(
         rollout, jaxpets.rewards.epistemic, toys.optimizer("icem", horizon=9)
     )
-    params = jaxpets.PlanParams(jax.jit(model.init)(KEY), ())
     act, lead = act_fn(planner, 1, num_envs), () if num_envs is None else (num_envs,)
-    calls = [compiled(act, place) for place in (places(), None)]
-    states = [first_state(planner, lead, places())] * 2
-    rng = np.random.default_rng(0)
-    for number in range(300):
-        told = given(number, rng.normal(size=(*lead, 2)), np.full(lead, number == 0))
-        actions = []
-        for i, call in enumerate(calls):
-            action, states[i] = call(params, KEY, states[i], told)
-            actions.append(action)
-        np.testing.assert_array_equal(*actions)
+    with jax.default_device(DEVICE):
+        params = jaxpets.PlanParams(jax.jit(model.init)(KEY), jnp.ones(2))
+        calls = [compiled(act, place) for place in (places(), None)]
+        states = [first_state(planner, lead, places())] * 2
+        rng = np.random.default_rng(0)
+        for number in range(300):
+            is_new = np.full(lead, number % 100 == 0)
+            told = given(number, rng.normal(size=(*lead, 2)), is_new)
+            actions = []
+            for i, call in enumerate(calls):
+                action, states[i] = call(params, KEY, states[i], told)
+                actions.append(action)
+            np.testing.assert_array_equal(*actions)
