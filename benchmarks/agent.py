@@ -1,10 +1,11 @@
-"""What `jaxpets.agent` adds to a plan: `act` and the plan alone, awaited, in turn.
+"""`act` of `jaxpets.agent`, and the plan alone in one's own loop, awaited, in turn.
 
 The plan alone is one compiled call whose action comes to the host, through `memory`: on
-a GPU the program writes it to the host's pinned memory, as `act` has it. `act` checks
-and copies the observation besides, and keeps what it did for `observe`. `added_ms` is
-the median of the differences, pair by pair. `copied_ms` is that of the plan alone whose
-action is copied from the device, which is how rows without `memory` have `plan_ms`.
+a GPU the program writes it to the host's pinned memory. `act` checks the observation
+besides, and keeps what it did for `observe`; on a GPU it does not wait for XLA to say
+that an action has come. `added_ms` is the median of the differences, pair by pair.
+`copied_ms` is that of the plan alone whose action is copied from the device, which is
+how rows without `memory` have `plan_ms`.
 
 With `--policy` it is a step of a distilled policy instead, which needs no plan: by
 onnxruntime on one thread, and by JAX, one after the other.
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def memory() -> str:
-    """Returns the kind of memory through which `act` gets its action."""
+    """Returns the kind of memory through which an action comes soonest."""
     device = jax.devices()[0]
     kinds = {one.kind for one in device.addressable_memories()}
     is_alone = jax.local_device_count() == 1

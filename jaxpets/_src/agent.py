@@ -11,7 +11,7 @@ from jax import Array
 from jaxpets._src import agent_file
 from jaxpets._src import agent_steps as computed
 from jaxpets._src import agent_world as told
-from jaxpets._src.agent_call import CallFn, compiled, first_state, places
+from jaxpets._src.agent_call import Direct, Mailbox, compiled, first_state, places
 from jaxpets._src.agent_steps import AgentSteps, Given, act_fn, agent_steps
 from jaxpets._src.agent_world import World, autoreset_of
 from jaxpets._src.checks import check_count, check_functions, check_record
@@ -127,7 +127,7 @@ class Agent:
         self._task: tuple[Planner, Any] | None = None
         self._acting: Planner | None = None  # whose state is `_plan`
         self._plan: Any = ()
-        self._acts: dict[Planner, CallFn] = {}
+        self._acts: dict[Planner, Direct | Mailbox] = {}
         self._seen = told.memory(cast(LearnerState, self._state).dataset)
         self.reset()
 
@@ -284,7 +284,7 @@ class Agent:
         self._seen.clear()
         self.reset()
 
-    def _compiled(self, planner: Planner) -> CallFn:
+    def _compiled(self, planner: Planner) -> Direct | Mailbox:
         if planner not in self._acts:
             step = act_fn(planner, self._steps.action_size, self._world.num_envs)
             self._acts[planner] = compiled(step, self._places)

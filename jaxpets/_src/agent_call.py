@@ -2,7 +2,6 @@
 
 import ctypes
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,8 +14,6 @@ from jaxpets._src.agent_steps import ActFn, Given
 from jaxpets._src.ensemble_params import EnsembleParams
 from jaxpets._src.types import Planner, PlanParams
 
-# `(PlanParams, key, state, Given) -> (action, state)`, the action of NumPy.
-CallFn = Callable[[PlanParams, Array, Any, Given], tuple[np.ndarray, Any]]
 _APART = ("gpu",)  # platforms whose memory is not the host's
 _UNSEEN = 0x7FC0DEAD  # a NaN that no arithmetic makes
 
@@ -60,19 +57,23 @@ def first_state(planner: Planner, lead: tuple[int, ...], places: Places | None) 
     return jax.device_put(state, places.device if places else None)
 
 
-def compiled(act: ActFn, places: Places | None) -> CallFn:
-    """Returns a step that is compiled, and waits for its action."""
-    if places is not None:
-        return Mailbox(act, places)
-    program: Any = jax.jit(act)
+def compiled(act: ActFn, places: Places | None) -> "Direct | Mailbox":
+    """Returns a step that compiles in its first call, and waits for its action."""
+    return Direct(act) if places is None else Mailbox(act, places)
 
-    def call(
-        params: PlanParams, key: Array, state: Any, given: Given
+
+class Direct:
+    """A compiled step as JAX has it."""
+
+    def __init__(self, act: ActFn) -> None:
+        self.program: Any = jax.jit(act)
+
+    def __call__(
+        self, params: PlanParams, key: Array, state: Any, given: Given
     ) -> tuple[np.ndarray, Any]:
-        action, state = program(params, key, state, given)
+        """Returns the action, a copy, and the state, which may not be computed yet."""
+        action, state = self.program(params, key, state, given)
         return np.array(action), state
-
-    return call
 
 
 class Mailbox:
@@ -106,7 +107,7 @@ class Mailbox:
     def __call__(
         self, params: PlanParams, key: Array, state: Any, given: Given
     ) -> tuple[np.ndarray, Any]:
-        """Returns the action, a copy, and the state, which may not be computed yet."""
+        """Returns what Direct does."""
         if self._given is None:
             self._given = self._shared(given)
         slot, self._slot = self._slot, None
@@ -133,7 +134,8 @@ class Mailbox:
 
     def _shared(self, numbers: Any) -> tuple[Any, Any]:
         """Returns numbers in that memory, and the same as arrays of NumPy."""
-        arrays: Any = jax.device_put(numbers, self._host)
+        own = jax.tree.map(np.array, numbers)  # a CPU may take them as they lie
+        arrays: Any = jax.device_put(own, self._host)
         jax.block_until_ready(arrays)
         return arrays, jax.tree.map(_seen, arrays)
 

@@ -104,4 +104,4 @@ def test_a_gymnasium_robot_goes_from_exploration_to_two_tasks():
     heights = [numbers(line)[0] for line in lines[2:]]
     assert all(-1.0 <= height <= 1.0 for height in heights)
     # Two tasks, one program.
-    assert agent._acts[names["actor"]]._cache_size() == 1
+    assert agent._acts[names["actor"]].program._cache_size() == 1
