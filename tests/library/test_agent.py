@@ -247,7 +247,7 @@ def test_another_planner_performs(make, trained):
 def test_it_acts_alike_through_pinned_memory_of_the_host(
     make, trained, num_envs, monkeypatch, tmp_path
 ):
-    device = jax.devices()[0]
+    (device,) = jax.tree.leaves(trained)[0].devices()
     if "pinned_host" not in {memory.kind for memory in device.addressable_memories()}:
         pytest.skip("this device has no such memory")
     obs = np.full((2,) if num_envs is None else (2, 2), 0.25)
