@@ -185,13 +185,14 @@ class Agent:
             planner = self._random
         if planner is not self._acting:
             self._is_new = np.ones(self._world.lead, bool)
-            self._acting = planner
             self._plan = first_state(planner, self._world.lead, self._places)
         given = Given(np.int32(self._counts.acts), self._is_new, seen)
         params = PlanParams(self._state.params, reward)
+        self._acting = None  # if it fails its state may have failed too
         action, self._plan = self._compiled(planner)(
             params, self._act_key, self._plan, given
         )
+        self._acting = planner
         self._is_new = np.zeros(self._world.lead, bool)
         self._awaited = seen, action
         self._counts = self._counts._replace(acts=self._counts.acts + 1)

@@ -101,20 +101,20 @@ class Mailbox:
         self.program: Any = jax.jit(
             program, donate_argnums=0, keep_unused=True, out_shardings=tuple(places)
         )
-        self._given: Any = None  # in that memory, and its views
-        self._slot: Any = None  # likewise; None while it is not known who writes there
+        # The slot and what is given, each with a view of it; None while it is not known
+        # who reads and writes there.
+        self._boxes: Any = None
 
     def __call__(
         self, params: PlanParams, key: Array, state: Any, given: Given
     ) -> tuple[np.ndarray, Any]:
         """Returns what Direct does."""
-        if self._given is None:
-            self._given = self._shared(given)
-        slot, self._slot = self._slot, None
-        if slot is None:
+        boxes, self._boxes = self._boxes, None
+        if boxes is None:
             action, _ = jax.eval_shape(self._act, params, key, state, given)
-            slot = self._shared(np.zeros(action.shape, action.dtype))
-        (slot, action), (inputs, views) = slot, self._given
+            zeros = np.zeros(action.shape, action.dtype)
+            boxes = self._shared(zeros), self._shared(given)
+        (slot, action), (inputs, views) = boxes
         slot.block_until_ready()  # the call before has ended, and reads no more
         for view, value in zip(views, given, strict=True):
             view[...] = value
@@ -122,14 +122,15 @@ class Mailbox:
         words[:] = _UNSEEN
         slot, state = self.program(slot, params, key, state, inputs)
         if slot.unsafe_buffer_pointer() != action.ctypes.data:
-            return np.array(slot), state  # XLA has put it elsewhere
+            action = _seen(slot.block_until_ready())  # XLA has put it elsewhere
+            words = words[:0]
         has_ended = False
         while (words == _UNSEEN).any():
             if has_ended:
-                return np.array(slot), state  # raises what has failed
+                return np.array(slot), state  # which raises what has failed
             has_ended = slot.is_ready()
             time.sleep(0)  # lets other threads of Python go on
-        self._slot = slot, action
+        self._boxes = (slot, action), (inputs, views)
         return action.copy(), state
 
     def _shared(self, numbers: Any) -> tuple[Any, Any]:

@@ -243,6 +243,26 @@ def test_another_planner_performs(make, trained):
     assert 3 <= agent.act(at(0.0)) <= 4
 
 
+def test_after_a_plan_that_failed_it_plans_anew(make, trained):
+    def checked(obs):
+        if obs[0] > 1:
+            raise ValueError("too far")
+        return obs[:1]
+
+    def step(params, key, state, obs):
+        shape = jax.ShapeDtypeStruct((1,), jnp.float32)
+        output, state = pull(params, key, state, obs)
+        there = jax.pure_callback(checked, shape, obs)
+        return output._replace(action=output.action + there), state + there[0]
+
+    agent = make(params=trained)
+    agent.perform(0.0, jaxpets.Planner(zero, step))
+    first = agent.act(at(0.5))
+    with pytest.raises(Exception, match="too far"):
+        agent.act(at(2.0))
+    np.testing.assert_array_equal(agent.act(at(0.5)), first)
+
+
 @pytest.mark.parametrize("num_envs", [None, 2])
 def test_it_acts_alike_through_pinned_memory_of_the_host(
     make, trained, num_envs, monkeypatch, tmp_path
