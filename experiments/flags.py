@@ -107,14 +107,17 @@ def of(
       SystemExit: after `--help`.
     """
     shown = default
+    # Without a help tyro need not read the source of every class for its texts.
+    quick = (tyro.conf.HelptextFromCommentsOff,)
     if command is not None and {"-h", "--help"} & set(argv):
-        shown = _without_unread(default, command)
+        shown, quick = _without_unread(default, command), ()
     found, rest = tyro.cli(
         type(shown),
         args=list(argv),
         default=shown,
         return_unknown_args=True,
         add_help=command is not None,
+        config=quick,
         registry=_AS_WRITTEN,
         prog=calling.usage("run", command),
     )
