@@ -51,6 +51,7 @@ DISTILLED = jaxpets.distill(
     action_high=ENV.action_high,
 )
 new_network = jax.jit(RND.init)
+new_task, new_distilled = jax.jit(TASK.init), jax.jit(DISTILLED.init)
 NOISY = jaxpets.particle_rollout(toys.noisy_cart, num_members=2, num_particles=4)
 LEARNED = jaxpets.particle_rollout(MODEL.sample, num_members=3, num_particles=6)
 
@@ -177,7 +178,7 @@ def jittered(gain, key, obs, action):
 
 def guided(i):
     params = PlanParams(jnp.float32(1.0), jnp.float32(i))
-    networks = TASK.init(params, key_of(i), dataset(i)).params
+    networks = new_task(params, key_of(i), dataset(i)).params
     return policies.Guided(params.reward, networks)
 
 
@@ -191,7 +192,7 @@ def policy_case(policy):
 def distill_case():
     def variant(i):
         params = PlanParams(jnp.float32(1.0), jnp.float32(i))
-        state = DISTILLED.init(params, key_of(i), dataset(i))
+        state = new_distilled(params, key_of(i), dataset(i))
         return params, key_of(i), state, dataset(i)
 
     return Case(DISTILLED.step, variant, (2, 0))

@@ -109,11 +109,12 @@ class Learned(NamedTuple):
     metrics: Any
 
     def value(self):
-        return LEARNER.value_fn(self.guided, states().data.obs[:50])
+        return VALUE(self.guided, states().data.obs[:50])
 
 
 LEARNER = build()
 INIT, STEP = jax.jit(LEARNER.init), jax.jit(LEARNER.step)
+VALUE = jax.jit(LEARNER.value_fn)
 
 
 @functools.cache
@@ -307,7 +308,7 @@ def test_a_step_is_that_by_hand(squash):
     np.testing.assert_allclose(biases(after), wanted, rtol=1e-5)
     np.testing.assert_allclose(metrics.value, value / params.scale, rtol=1e-5)
     guided = Guided(known.reward, begun.params)
-    found = LEARNER.value_fn(guided, states().data.obs[:3])
+    found = VALUE(guided, states().data.obs[:3])
     np.testing.assert_allclose(found, value / params.scale, rtol=1e-5)
 
 

@@ -76,6 +76,7 @@ def learned(squash=0.0):
     return distiller, before, state, said
 
 
+@functools.partial(jax.jit, static_argnames=("planner", "steps"))
 def driven(planner, data, start, steps=40):
     """Positions of the cart under a planner."""
 
@@ -86,7 +87,7 @@ def driven(planner, data, start, steps=40):
         return (obs, state), obs[0]
 
     keys = jax.random.split(jax.random.key(0), steps)
-    return np.asarray(jax.lax.scan(step, (start, planner.init()), keys)[1])
+    return jax.lax.scan(step, (start, planner.init()), keys)[1]
 
 
 def test_one_policy_goes_where_the_planner_goes_for_every_task():
@@ -115,7 +116,8 @@ def test_a_value_is_what_the_planner_expects(squash):
     def expected(key, obs):
         return PLANNER.step(PlanParams(GAIN, target), key, PLANNER.init(), obs)[0].value
 
-    wanted = jax.vmap(expected)(jax.random.split(jax.random.key(0), 20), rows)
+    keys = jax.random.split(jax.random.key(0), 20)
+    wanted = jax.jit(jax.vmap(expected))(keys, rows)
     found = distiller.value_fn(Guided(target, state.params), rows)
     assert np.corrcoef(found, wanted)[0, 1] > 0.95
     assert np.abs(found - wanted).mean() < 0.2 * np.abs(wanted).mean()

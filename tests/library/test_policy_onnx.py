@@ -48,7 +48,7 @@ def policy_of(space, obs_size, goals):
     actions = jnp.zeros((50, 2), jnp.float32)
     dataset = toys.dataset_of(jaxpets.Transition(rows, actions, rows), capacity=50)
     params = PlanParams((), jnp.float32(0.5))
-    params = made.init(params, jax.random.key(0), dataset).params
+    params = jax.jit(made.init)(params, jax.random.key(0), dataset).params
     actor = jax.tree.map(
         lambda x: jnp.asarray(rng.normal(0, 0.3, x.shape), jnp.float32), params.actor
     )
