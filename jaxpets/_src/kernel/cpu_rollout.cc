@@ -1,11 +1,12 @@
 // A whole particle rollout on the cores of a CPU, in float32.
 //
-// A block is a few particles of one member, imagined for all H steps by one core. Entry
-// i of all its particles is one row of BLOCK numbers: what is done to a particle is a
-// loop over a row, which the compiler turns into vector instructions. The inputs of a
-// layer stay in the core's first cache, the weights of a member, half a megabyte at the
-// paper's size, in its second. Nothing but the path is written to memory, and cores meet
-// only at the end.
+// A block is 32 particles of one member, imagined for all H steps by one core. Entry i of
+// all its particles is one row of BLOCK numbers: what is done to a particle is a loop
+// over a row, which the compiler turns into vector instructions. The inputs of a layer
+// stay in the core's first cache, the weights of a member, half a megabyte at the paper's
+// size, in its second or beyond. So a tile of them that was read serves all groups of a
+// block: as many particles as the sums of a tile have registers for. Nothing but the
+// path is written to memory, and cores meet only at the end.
 
 #include <atomic>
 #include <condition_variable>
@@ -28,7 +29,8 @@ constexpr int LANES = 4, VECTORS = 4;  // of 32
 #else
 constexpr int LANES = 8, VECTORS = 2;  // of 16
 #endif
-constexpr int BLOCK = LANES * VECTORS;
+constexpr int GROUP = LANES * VECTORS, BLOCK = 32;
+static_assert(BLOCK % GROUP == 0, "a block has whole groups");
 
 typedef float Vector __attribute__((vector_size(4 * LANES), may_alias));
 using Row = float[BLOCK];
@@ -36,6 +38,7 @@ using Row = float[BLOCK];
 struct alignas(64) Scratch {
   Row activations[2][WIDEST];
   Row obs[OBS], target[OBS];
+  int used;  // particles of the block, in whole groups; of the others nothing is known
 };
 
 // Where one particle's entries are: those of row p of every row.
@@ -62,9 +65,10 @@ float activated(float x) {
   return sigmoid_times(x, x);
 }
 
+// Of the group whose particles begin at `first`.
 template <int OUTPUTS, bool IS_HEAD>
 void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
-                   Row* outputs) {
+                   Row* outputs, int first) {
   Vector sums[OUTPUTS][VECTORS];
 #pragma GCC unroll 8
   for (int j = 0; j < OUTPUTS; ++j)
@@ -75,7 +79,7 @@ void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
     Vector input[VECTORS];
 #pragma GCC unroll 8
     for (int v = 0; v < VECTORS; ++v)
-      input[v] = *reinterpret_cast<const Vector*>(&inputs[i][v * LANES]);
+      input[v] = *reinterpret_cast<const Vector*>(&inputs[i][first + v * LANES]);
 #pragma GCC unroll 8
     for (int j = 0; j < OUTPUTS; ++j)
 #pragma GCC unroll 8
@@ -85,10 +89,11 @@ void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
   for (int j = 0; j < OUTPUTS; ++j)
 #pragma GCC unroll 8
     for (int v = 0; v < VECTORS; ++v)
-      *reinterpret_cast<Vector*>(&outputs[j][v * LANES]) = sums[j][v];
+      *reinterpret_cast<Vector*>(&outputs[j][first + v * LANES]) = sums[j][v];
   if (IS_HEAD) return;
   for (int j = 0; j < OUTPUTS; ++j)
-    for (int p = 0; p < BLOCK; ++p) outputs[j][p] = activated(outputs[j][p]);
+    for (int p = first; p < first + GROUP; ++p)
+      outputs[j][p] = activated(outputs[j][p]);
 }
 
 // Runs a layer and those after it; returns where the last one's outputs are.
@@ -100,9 +105,12 @@ const Row* run_layers(const float* weights, Scratch& scratch) {
   Row* outputs = scratch.activations[(LAYER + 1) % 2];
   const float* tile = weights;
   for (int j = 0; j + TILE <= TO; j += TILE, tile += TILE * (FROM + 1))
-    multiply_tile<TILE, IS_HEAD>(tile, inputs, FROM, outputs + j);
+    for (int first = 0; first < scratch.used; first += GROUP)
+      multiply_tile<TILE, IS_HEAD>(tile, inputs, FROM, outputs + j, first);
   if constexpr (TO % TILE != 0)
-    multiply_tile<TO % TILE, IS_HEAD>(tile, inputs, FROM, outputs + TO / TILE * TILE);
+    for (int first = 0; first < scratch.used; first += GROUP)
+      multiply_tile<TO % TILE, IS_HEAD>(tile, inputs, FROM, outputs + TO / TILE * TILE,
+                                        first);
   if constexpr (IS_HEAD)
     return outputs;
   else
@@ -149,9 +157,10 @@ void move_all(const float* shared, Scratch& scratch) {
 }
 
 // The last block of a member may have fewer particles than rows have room for: the rest
-// of a row imagines the actions of the last one, and is not stored.
+// of a row has the actions of the last one, and is not stored.
 void run_block(const Rollout& rollout, int member, int first, Scratch& scratch) {
   const int count = rollout.num_candidates * rollout.particles - first;
+  scratch.used = count < BLOCK ? round_up(count, GROUP) : BLOCK;
   const int64_t stride = path_stride(rollout);
   const float* actions[BLOCK];
   float* paths[BLOCK];
