@@ -31,9 +31,7 @@ from jaxpets._src.kernel.build import Kind
 
 pytestmark = needs_cpu
 
-# The most particles of one member that are imagined together: with AVX-512, and
-# otherwise 16.
-BLOCK = 32
+BLOCK = 32  # particles of one member that are imagined together
 
 
 def test_any_width_and_depth_will_do():
@@ -83,7 +81,7 @@ def many():
 
 @pytest.mark.parametrize("num_samples", [1, 7, 8, 9, 15, 16, 17, 70])
 def test_blocks_need_not_be_full(num_samples):
-    """Two particles of each candidate: blocks of 16 and 32, with less and more."""
+    """Two particles of each candidate: groups of 16 and blocks of 32, less and more."""
     params, key, obs, actions = many()
     part = window(key, jnp.int32(0), num_samples, 70)  # their noise beside the others
     got = CPU.run(SMALL)(params, part, obs, actions[:num_samples])
@@ -102,7 +100,7 @@ def without(instructions, monkeypatch, folder):
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="has flags of its own")
-def test_processors_with_shorter_vectors_have_smaller_blocks(monkeypatch, tmp_path):
+def test_processors_with_shorter_vectors_have_smaller_groups(monkeypatch, tmp_path):
     without("avx512f", monkeypatch, tmp_path)
     # Another width: the kernel of a model that was met before would not be built.
     case = dataclasses.replace(SMALL, hidden_sizes=(16, 25), num_samples=70)
