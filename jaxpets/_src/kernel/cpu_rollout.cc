@@ -65,10 +65,11 @@ float activated(float x) {
   return sigmoid_times(x, x);
 }
 
-// Of the group whose particles begin at `first`.
+// Of the group whose particles begin at `first`. Inlined, some of the sums would be kept
+// in memory.
 template <int OUTPUTS, bool IS_HEAD>
-void multiply_tile(const float* weights, const Row* inputs, int num_inputs,
-                   Row* outputs, int first) {
+__attribute__((noinline)) void multiply_tile(const float* weights, const Row* inputs,
+                                             int num_inputs, Row* outputs, int first) {
   Vector sums[OUTPUTS][VECTORS];
 #pragma GCC unroll 8
   for (int j = 0; j < OUTPUTS; ++j)
