@@ -65,11 +65,11 @@ float activated(float x) {
   return sigmoid_times(x, x);
 }
 
-// Of the group whose particles begin at `first`. Inlined, some of the sums would be kept
-// in memory.
+// A tile for the group whose particles begin at `first`. Inlined, some of the sums would
+// be kept in memory.
 template <int OUTPUTS, bool IS_HEAD>
-__attribute__((noinline)) void multiply_tile(const float* weights, const Row* inputs,
-                                             int num_inputs, Row* outputs, int first) {
+__attribute__((noinline)) void multiply_group(const float* weights, const Row* inputs,
+                                              int num_inputs, Row* outputs, int first) {
   Vector sums[OUTPUTS][VECTORS];
 #pragma GCC unroll 8
   for (int j = 0; j < OUTPUTS; ++j)
@@ -97,6 +97,13 @@ __attribute__((noinline)) void multiply_tile(const float* weights, const Row* in
       outputs[j][p] = activated(outputs[j][p]);
 }
 
+template <int OUTPUTS, bool IS_HEAD>
+void multiply_tile(const float* weights, const Row* inputs, int num_inputs, Row* outputs,
+                   int used) {
+  for (int first = 0; first < used; first += GROUP)
+    multiply_group<OUTPUTS, IS_HEAD>(weights, inputs, num_inputs, outputs, first);
+}
+
 // Runs a layer and those after it; returns where the last one's outputs are.
 template <int LAYER = 0>
 const Row* run_layers(const float* weights, Scratch& scratch) {
@@ -106,12 +113,10 @@ const Row* run_layers(const float* weights, Scratch& scratch) {
   Row* outputs = scratch.activations[(LAYER + 1) % 2];
   const float* tile = weights;
   for (int j = 0; j + TILE <= TO; j += TILE, tile += TILE * (FROM + 1))
-    for (int first = 0; first < scratch.used; first += GROUP)
-      multiply_tile<TILE, IS_HEAD>(tile, inputs, FROM, outputs + j, first);
+    multiply_tile<TILE, IS_HEAD>(tile, inputs, FROM, outputs + j, scratch.used);
   if constexpr (TO % TILE != 0)
-    for (int first = 0; first < scratch.used; first += GROUP)
-      multiply_tile<TO % TILE, IS_HEAD>(tile, inputs, FROM, outputs + TO / TILE * TILE,
-                                        first);
+    multiply_tile<TO % TILE, IS_HEAD>(tile, inputs, FROM, outputs + TO / TILE * TILE,
+                                      scratch.used);
   if constexpr (IS_HEAD)
     return outputs;
   else
