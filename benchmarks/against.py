@@ -48,18 +48,23 @@ def pairs(today: Sequence[Row], committed: Iterable[Row]) -> Iterator[Pair]:
         yield Pair(row, then, speed)
 
 
-def report(today: Sequence[Row], folder: Path = RESULTS) -> list[Row]:
-    """Prints today's rows beside those in a folder, then the plans of other systems.
-
-    Returns:
-      The rows whose speed is below nine tenths of the committed one.
-    """
+def committed_rows(folder: Path = RESULTS) -> list[Row]:
+    """Returns the rows of all files of a folder, the oldest first."""
     lines = [
         json.loads(line)
         for path in sorted(folder.glob("*.jsonl"))
         for line in path.read_text().splitlines()
     ]
-    found = list(pairs(today, lines))
+    return sorted(lines, key=lambda row: row.get("date", ""))
+
+
+def report(today: Sequence[Row], committed: Sequence[Row]) -> list[Row]:
+    """Prints today's rows beside the committed ones, then the plans of other systems.
+
+    Returns:
+      The rows whose speed is below nine tenths of the committed one.
+    """
+    found = list(pairs(today, committed))
     print(f"{'median ms':>10}  {'committed':>10}  {'speed':>6}")
     for row, then, speed in found:
         cells = [f"{row['median_ms']:>10.4g}"]
@@ -67,7 +72,7 @@ def report(today: Sequence[Row], folder: Path = RESULTS) -> list[Row]:
         cells.append(f"{speed:>6.2f}" if speed else f"{'-':>6}")
         print(*cells, row["benchmark"], _text(row), sep="  ")
     device = today[0]["device"]
-    for row in lines:
+    for row in committed:
         if "source" in row and row["device"] == device:
             print(f"{row['ms_per_plan']:>10.4g}  {row['name']}, {row['engine']}, "
                   f"{row['dtype']}, {row['seeds']} seeds: {row['source']}")  # fmt: skip

@@ -51,13 +51,22 @@ def test_what_became_slower_is_returned_and_all_is_printed(tmp_path, capsys):
     (tmp_path / "card.jsonl").write_text("\n".join(map(json.dumps, lines)))
     (tmp_path / "peers.jsonl").write_text(json.dumps(rival))
     today = [plain(10.0), row(2.2, "fit", seeds=1), row(4.6, "fit", seeds=4)]
-    (slower,) = against.report(today, tmp_path)
+    (slower,) = against.report(today, against.committed_rows(tmp_path))
     assert slower["sizes"] == {"seeds": 4}
     text = capsys.readouterr().out.splitlines()
     assert text[2].split() == ["2.75", "2.5", "0.91", "fit", "seeds=1"]
     assert text[3].split()[:3] == ["5.75", "7.5", "0.87"]
     assert text[4].split()[:3] == ["44", "rival,", "jit,"]
     assert len(text) == 5
+
+
+def test_a_variant_of_an_earlier_day_is_not_the_last_row(tmp_path):
+    days = {"a": "2026-11-28", "z_variants": "2026-11-22"}
+    for name, day in days.items():
+        line = json.dumps({**row(1.0, "trace"), "date": day})
+        (tmp_path / f"{name}.jsonl").write_text(line)
+    found = against.committed_rows(tmp_path)
+    assert [one["date"] for one in found] == sorted(days.values())
 
 
 def test_what_is_committed_can_be_measured_against():
