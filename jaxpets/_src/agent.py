@@ -23,6 +23,7 @@ from jaxpets._src.types import Planner, PlanParams
 
 _NO_DATA = RewardData()
 _BLOCK = 256  # rows that are moved to the device at a time
+_CALLS = 2**31  # after so many, draws begin anew
 
 
 def agent(
@@ -103,8 +104,7 @@ class Agent:
 
     What it has learned is a LearnerState, and all that it computes is pure functions;
     this class holds the state, compiles each function once, and speaks NumPy. The first
-    `act` with a planner compiles, for seconds. Where a machine would wait for it, call
-    it once before with any observation, then `reset`.
+    `act` with a planner compiles, for seconds: call it, and `reset`, before it matters.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Agent:
     ) -> None:
         self._planner, self._random, self._world = planner, random_planner, world
         self._steps = steps
-        self._append = jax.jit(steps.append)
+        self._append: computed.AppendFn = jax.jit(steps.append)
         self._learn: computed.LearnFn = jax.jit(steps.learn)
         init_key, self._act_key, self._learn_key = jax.random.split(key, 3)
         self._state: LearnerState = jax.jit(steps.init)(init_key, params)
@@ -186,12 +186,11 @@ class Agent:
         if planner is not self._acting:
             self._is_new = np.ones(self._world.lead, bool)
             self._plan = first_state(planner, self._world.lead, self._places)
-        given = Given(np.int32(self._counts.acts), self._is_new, seen)
+        given = Given(np.int32(self._counts.acts % _CALLS), self._is_new, seen)
         params = PlanParams(self._state.params, reward)
         self._acting = None  # if it fails its state may have failed too
-        action, self._plan = self._compiled(planner)(
-            params, self._act_key, self._plan, given
-        )
+        step = self._compiled(planner)
+        action, self._plan = step(params, self._act_key, self._plan, given)
         self._acting = planner
         self._is_new = np.zeros(self._world.lead, bool)
         self._awaited = seen, action
@@ -235,8 +234,7 @@ class Agent:
         kept = ~self._is_resetting & is_finite
         if kept.any():
             self._seen.append((obs[kept], action[kept], reached[kept]))
-        steps = self._counts.steps + int(kept.sum())
-        self._counts = self._counts._replace(steps=steps)
+        self._counts = self._counts._replace(steps=self.num_steps + int(kept.sum()))
         self._awaited = None
         if world.autoreset == "NextStep":
             # The next step of these worlds leads from an end to a start.
@@ -258,8 +256,10 @@ class Agent:
         if not self._counts.steps:
             raise RuntimeError("learn needs what was observed, but nothing was yet.")
         self._remember()
-        key = jax.random.fold_in(self._learn_key, self._counts.fits)
-        self._state, metrics = self._learn(key, self._state)
+        key = jax.random.fold_in(self._learn_key, self._counts.fits % _CALLS)
+        learned = self._learn(key, self._state)
+        jax.block_until_ready(learned)  # or it failed, and nothing is lost
+        self._state, metrics = learned
         self._counts = self._counts._replace(fits=self._counts.fits + 1, trained=1)
         return jax.device_get(metrics)
 
@@ -293,6 +293,8 @@ class Agent:
 
     def _remember(self) -> None:
         """Moves what was seen to the dataset, in blocks of one size for one program."""
+        state = self._state
         for rows, count in told.blocks(self._seen, _BLOCK):
-            self._state = self._append(self._state, rows, count)
+            state = self._append(state, rows, count)
+        self._state = jax.block_until_ready(state)  # all or, if it fails, nothing
         self._seen.clear()

@@ -76,6 +76,6 @@ def _counts(file: tensor_file.TensorFile) -> Counts:
                 f"{want!r}, got {got!r}."
             )
     texts = [file.metadata.get(name, "") for name in Counts._fields]
-    if not all(text.isascii() and text.isdigit() and len(text) < 10 for text in texts):
+    if not all(text.isascii() and text.isdigit() and len(text) < 19 for text in texts):
         raise ValueError(f"{file.path} is no agent that can be read: it counts wrong.")
     return Counts(*map(int, texts))

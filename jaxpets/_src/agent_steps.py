@@ -17,6 +17,7 @@ from jaxpets._src.fit_records import FitMetrics, Fitter
 from jaxpets._src.learner import LearnerState, RewardData, fitted, new_state
 from jaxpets._src.types import Planner, PlanParams, Transition
 
+AppendFn = Callable[[LearnerState, Transition, Any], LearnerState]
 LearnFn = Callable[[Array, LearnerState], tuple[LearnerState, FitMetrics]]
 
 
@@ -51,7 +52,7 @@ class AgentSteps(NamedTuple):
 
     action_size: int
     init: Callable[[Array, EnsembleParams | None], LearnerState]
-    append: Callable[[LearnerState, Transition, Any], LearnerState]
+    append: AppendFn
     learn: LearnFn
 
 
@@ -99,7 +100,9 @@ def act_fn(planner: Planner, action_size: int, num_envs: int | None) -> ActFn:
 
 
 def strongly_typed(tree: Any) -> Any:
-    """Returns numbers as arrays of their own type: one of Python would compile anew.
+    """Returns numbers, copied, as arrays of their own type.
+
+    With a type of Python's they would compile anew.
 
     Raises:
       TypeError: for what is none, as a reward's function in place of its data.
@@ -107,8 +110,8 @@ def strongly_typed(tree: Any) -> Any:
 
     def array(leaf: Any) -> Array:
         dtype = leaf.dtype if isinstance(leaf, Array) else np.asarray(leaf).dtype
-        if dtype.kind in "OUS":
+        if not any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_)):
             raise TypeError(f"reward must be a pytree of numbers, got {leaf!r} in it.")
-        return jnp.asarray(leaf, jax.dtypes.canonicalize_dtype(dtype))
+        return jnp.array(leaf, jax.dtypes.canonicalize_dtype(dtype))
 
     return jax.tree.map(array, tree)

@@ -263,6 +263,68 @@ def test_after_a_plan_that_failed_it_plans_anew(make, trained):
     np.testing.assert_array_equal(agent.act(at(0.5)), first)
 
 
+def test_a_task_is_not_the_callers_memory(make, trained):
+    agent = make(params=trained)
+    # An array of NumPy that JAX could take as it lies.
+    memory = np.zeros(32, np.float32)
+    start = (-memory.ctypes.data % 64) // 4
+    goal = memory[start : start + 1]
+    agent.perform(goal)
+    goal[:] = 0.75
+    assert agent.act(at(0.0)) == pytest.approx(0.0)
+
+
+def test_what_was_learned_outlives_a_fit_that_fails_late(make, trained, monkeypatch):
+    """On a GPU a program may have failed only after its call has returned."""
+    agent = make(params=trained)
+    agent.act(at(0.0))
+    agent.observe(at(1.0))
+
+    def learn(key, state):
+        failed = jax.tree.map(jnp.copy, state)
+        jax.tree.map(lambda leaf: leaf.delete(), failed)
+        return failed, zero()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(agent, "_learn", learn)
+        with pytest.raises(RuntimeError, match="deleted"):
+            agent.learn()
+    assert rows(agent) == [(0.0, 1.0)]
+    assert agent.learn().num_updates > 0
+
+
+def test_what_was_seen_is_learned_once_if_learning_is_broken_off(make, monkeypatch):
+    agent = make(capacity=600)
+    for step in range(600):
+        agent.act(at(step))
+        agent.observe(at(step + 1))
+    append, calls = agent._append, []
+
+    def second(*given):
+        calls.append(given)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return append(*given)
+
+    monkeypatch.setattr(agent, "_append", second)
+    with pytest.raises(KeyboardInterrupt):
+        agent.learn()
+    assert rows(agent) == [(float(t), t + 1.0) for t in range(600)]
+
+
+def test_an_agent_may_count_as_long_as_it_acts(make, trained, tmp_path):
+    path, agent = tmp_path / "a", make(params=trained)
+    agent._counts = agent._counts._replace(acts=2**31 - 1, fits=2**31, steps=10**12)
+    agent.save(path)
+    agent = make(params=trained)
+    agent.load(path)
+    for step in range(2):
+        agent.act(at(step))
+        agent.observe(at(step + 1))
+    agent.learn()
+    assert agent.num_steps == 10**12 + 2
+
+
 @pytest.mark.parametrize("num_envs", [None, 2])
 def test_it_acts_alike_through_pinned_memory_of_the_host(
     make, trained, num_envs, monkeypatch, tmp_path
@@ -376,7 +438,8 @@ def test_what_an_agent_may_not_be_made_of(make, parts):
         make(params=jax.jit(toys.small_ensemble(obs_size=3).init)(jax.random.key(0)))
     with pytest.raises(TypeError, match="planner must be a Planner"):
         make().perform((), 3)
-    for reward in (toys.reach, "up", {"goal": object()}):
+    days = np.zeros(1, "datetime64[D]")
+    for reward in (toys.reach, "up", {"goal": object()}, jax.random.key(0), days):
         with pytest.raises(TypeError, match="reward must be a pytree of numbers, got"):
             make().perform(reward)
     with pytest.raises(TypeError, match=r"reward_data.init must be a function, got A"):
