@@ -29,10 +29,10 @@ def host_call(
       size: of the last axis of what it returns.
 
     Returns:
-      `[I] -> [size]`, float32; a call fails if `function` returns another shape. Under
-      any nest of `jax.vmap` the host is called once for the whole batch; of a program
-      over several devices each calls it, under `jax.shard_map` with its own share. It
-      has no gradient.
+      `[I] -> [size]`, float32. A call fails if it gets another number of axes, or if
+      `function` returns another shape. Under any nest of `jax.vmap` the host is called
+      once for the whole batch; of a program over several devices each calls it, under
+      `jax.shard_map` with its own share. It has no gradient.
     """
 
     def rows_of(inputs: np.ndarray) -> np.ndarray:
@@ -68,6 +68,8 @@ def host_call(
     default = functools.partial(jax.pure_callback, elsewhere, shape, **vmapped)
 
     def call(inputs: Array) -> Array:
+        if inputs.ndim != 1:  # a GPU would be given as many rows as there are
+            raise ValueError(f"inputs must have one axis, [I], got {[*inputs.shape]}.")
         choose: Any = jax.lax.platform_dependent
         return choose(
             inputs.astype(jnp.float32), cpu=direct, cuda=direct, default=default

@@ -107,6 +107,12 @@ def test_another_shape_is_refused(inputs, function):
         jax.block_until_ready(jax.jit(jax.vmap(host_call(function, 2)))(inputs[0]))
 
 
+@pytest.mark.parametrize("shape", [(3, 5), (1, 5), ()])
+def test_it_takes_one_axis(shape):
+    with pytest.raises(ValueError, match=r"inputs must have one axis, \[I\], got"):
+        host_call(sums, 2)(jnp.zeros(shape))
+
+
 def test_it_has_no_gradient(inputs):
     call = host_call(sums, 2)
     with pytest.raises(ValueError, match="do not support JVP"):
