@@ -200,7 +200,7 @@ def test_an_ensemble_of_ones_own_is_the_fitters(asked, field):
 @pytest.fixture
 def unbuilt(cache, registered, monkeypatch):
     """Nothing is in a cache, nothing is registered. Returns what was."""
-    monkeypatch.setattr(module, "load_kernel", build.load_kernel.__wrapped__)
+    monkeypatch.setattr(module, "load_kernel", build.build_kernel)
     return registered
 
 

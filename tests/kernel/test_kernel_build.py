@@ -7,6 +7,8 @@ import platform
 import re
 import shutil
 import tempfile
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -17,7 +19,7 @@ from jaxpets._src.kernel import build
 from jaxpets._src.kernel.build import BuildError, Kind
 
 # Without a cache in memory: what a process does the first time.
-load = build.load_kernel.__wrapped__
+load = build.build_kernel
 
 pytestmark = pytest.mark.usefixtures("cache", "registered")
 
@@ -46,6 +48,20 @@ def test_a_process_asks_once(compiler, making, registered):
     target, _ = build.load_kernel("// asked twice", Kind.WGMMA_REFERENCE)
     assert len(making.commands) == 1 and registered == [(target, "cpu")]
     assert target.startswith("jaxpets_rollout_wgmma_reference_")
+
+
+def test_threads_of_a_process_ask_once(compiler, making, registered):
+    """XLA takes a target once: that of another library would be refused."""
+    compiler(making.script)
+    barrier = threading.Barrier(4)
+
+    def ask(_):
+        barrier.wait()
+        return build.load_kernel("// asked at once", Kind.WGMMA_REFERENCE)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(ask, range(4)))) == 1
+    assert len(making.commands) == len(registered) == 1
 
 
 @pytest.mark.parametrize("kind", [Kind.CPU, Kind.WGMMA_REFERENCE])

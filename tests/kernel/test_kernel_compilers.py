@@ -15,7 +15,7 @@ from jaxpets._src.kernel.build import BuildError, Kind
 
 pytestmark = pytest.mark.usefixtures("cache", "registered")
 # Without a cache in memory: what a process does the first time.
-load = build.load_kernel.__wrapped__
+load = build.build_kernel
 # In a script: $2 is then where the library goes.
 OUTPUT = 'while [ "$1" != -o ]; do shift; done'
 

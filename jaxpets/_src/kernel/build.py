@@ -13,6 +13,7 @@ import re
 import shutil
 import signal
 import subprocess
+import threading
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,8 +68,13 @@ class Kernel(NamedTuple):
     compiler: str  # name and version of what built it
 
 
-@functools.cache
 def load_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
+    """Returns what `build_kernel` does, by which it is built once in this process."""
+    with _ONE_AT_A_TIME:  # as XLA takes no target twice
+        return _built(model, kind, arch)
+
+
+def build_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
     """Compiles a kernel for a model and registers it with XLA.
 
     The library is kept for the next process, see `cache`.
@@ -101,6 +107,10 @@ def load_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
     where = "CUDA" if kind.is_for_gpu else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
     return Kernel(target, version)
+
+
+_built = functools.cache(build_kernel)
+_ONE_AT_A_TIME = threading.Lock()
 
 
 def _shipped_sources() -> dict[str, str]:
