@@ -64,6 +64,8 @@ def report(today: Sequence[Row], committed: Sequence[Row]) -> list[Row]:
     Returns:
       The rows whose speed is below nine tenths of the committed one.
     """
+    if not today:
+        return []
     found = list(pairs(today, committed))
     print(f"{'median ms':>10}  {'committed':>10}  {'speed':>6}")
     for row, then, speed in found:

@@ -58,6 +58,7 @@ def test_what_became_slower_is_returned_and_all_is_printed(tmp_path, capsys):
     assert text[3].split()[:3] == ["5.75", "7.5", "0.87"]
     assert text[4].split()[:3] == ["44", "rival,", "jit,"]
     assert len(text) == 5
+    assert against.report([], against.committed_rows(tmp_path)) == []
 
 
 def test_a_variant_of_an_earlier_day_is_not_the_last_row(tmp_path):

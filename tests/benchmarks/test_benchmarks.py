@@ -249,8 +249,30 @@ def test_the_set_for_a_gpu_is_made_of_valid_flags(monkeypatch, tmp_path):
     # Flags are parsed by the real programs; only the measuring is left out.
     monkeypatch.setattr(rows_module, "report", record)
     path = tmp_path / "rows.jsonl"
-    assert all_benchmarks.main(["--tiny", "--json", str(path)]) == []
+    assert all_benchmarks.main(["--tiny", "--json", str(path)]) == ([], [])
     assert seen == [path] * len(all_benchmarks.SET)
+
+
+def test_of_the_set_only_what_a_gpu_never_ran_may_be_left_out(monkeypatch, capsys):
+    commands = (plan, "--seeds 1"), (plan, "--engine kernel --seeds 1"), (trace, "")
+    monkeypatch.setattr(all_benchmarks, "SET", commands)
+    done, left_out = all_benchmarks.main(["--tiny", "--repeats", "1"])
+    assert [row["engine"] for row in done] == ["scan"]
+    assert left_out == [
+        "benchmarks.plan --engine kernel --seeds 1",
+        "benchmarks.trace ",
+    ]
+    assert "f32 only" in capsys.readouterr().out  # why the kernel could not run
+    committed = [
+        {**row, "device": device, "sizes": {"engine": engine}}
+        for row in done
+        for device, engine in (("a", "scan"), ("b", "kernel"))
+    ]
+    assert all_benchmarks.gone(left_out, committed, "a") == []
+    assert all_benchmarks.gone(left_out, committed, "b") == left_out[:1]
+    monkeypatch.setattr(all_benchmarks, "SET", ((plan, "--no-such-flag"),))
+    with pytest.raises(SystemExit, match="2"):
+        all_benchmarks.main(["--tiny"])
 
 
 def test_a_row_is_on_disk_before_the_next_is_measured(tmp_path):
