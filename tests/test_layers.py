@@ -424,8 +424,11 @@ def test_sizes_stay_small_outside(name):
     assert len(path_of(name).read_text().splitlines()) <= 300
 
 
-def test_sizes_of_benchmarks_stay_small():
-    for path in REPOSITORY.joinpath("benchmarks").glob("*.py"):
+def test_sizes_of_benchmarks_and_kernels_stay_small():
+    kernels = PACKAGE.joinpath("_src/kernel").iterdir()
+    sources = [path for path in kernels if path.suffix in (".cc", ".cu", ".h")]
+    assert sources
+    for path in [*REPOSITORY.joinpath("benchmarks").glob("*.py"), *sources]:
         assert len(path.read_text().splitlines()) <= 300, path.name
 
 

@@ -25,9 +25,10 @@ The numbers. Parameters are packed once per plan, and handed over at every call:
 
 Who includes whom:
 
-    wgmma_rollout.cu    gpu_layout.h, gpu_launch.h, wgmma.h, wgmma_slice.h
+    wgmma_rollout.cu    gpu_layout.h, gpu_launch.h, wgmma.h, wgmma_{feed,slice}.h
     mma_rollout.cu      gpu_layout.h, gpu_launch.h, gpu_particles.h, mma_product.h
     wgmma_slice.h       mma.h, wgmma_memory.h: a few particles that share their columns
+    wgmma_feed.h        wgmma_memory.h: the producer, of weights and noise
     wgmma_memory.h      hopper.h, wgmma_warp.h: what a block shares, who waits for what
     wgmma_warp.h        gpu_particles.h: a warp's particles, as Hopper's kernel has them
     hopper.h            gpu_particles.h: barriers, and copies that arrive at them
