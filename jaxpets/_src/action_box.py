@@ -49,8 +49,7 @@ def action_box(action_low: ArrayLike, action_high: ArrayLike) -> ActionBox:
       TypeError, ValueError: for bounds that are no box, also of float32.
     """
     _check(action_low, action_high)
-    low = jnp.asarray(action_low, jnp.float32)
-    high = jnp.asarray(action_high, jnp.float32)
+    low, high = (jnp.array(bound, jnp.float32) for bound in (action_low, action_high))
     return ActionBox(low, high, (low + high) / 2, (high - low) / 2)
 
 

@@ -71,7 +71,8 @@ def cem(
       num_iterations: iterations per call.
       momentum: share of the old mean and variance that is kept; may be traced.
       min_variance: the search freezes once no variance exceeds this, in units of a
-        box scaled to `[-1, 1]`; may be traced.
+        box scaled to `[-1, 1]`; may be traced. It starts at 0.25, so that more than
+        that allows no search.
       legacy_variance: take the elites' variance without momentum, as the first
         public PETS code did by mistake until November 2018.
       unroll: compile the iterations one after the other and not as a loop. The search

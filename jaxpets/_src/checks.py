@@ -15,6 +15,7 @@ from jax import Array
 from jax.core import Tracer
 
 T = TypeVar("T")
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_count(
@@ -35,12 +36,13 @@ def is_sequence(values: Any) -> TypeGuard[Sequence[Any]]:
     return isinstance(values, (tuple, list))
 
 
-def check_counts(name: str, values: Any) -> None:
-    """Raises unless `values` is a tuple or list of positive Python integers."""
+def check_counts(name: str, values: Any) -> tuple[int, ...]:
+    """Returns a tuple or list of positive Python integers as a tuple, or raises."""
     if not is_sequence(values):
         raise TypeError(f"{name} must be a tuple of ints, got {values!r}.")
     for value in values:
         check_count(name, value)
+    return tuple(values)
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -52,13 +54,13 @@ def check_flag(name: str, value: Any) -> None:
 def check_real(name: str, value: Any, low: float, high: float = math.inf) -> float:
     """Returns `value`, a finite number in `[low, high]`, as a Python number, or raises.
 
-    A Python number takes the type of what it meets; NumPy's of 64 bits would give its
-    own to it under x64.
+    What float32 does not hold is not finite. A Python number takes the type of what it
+    meets; NumPy's of 64 bits would give its own to it under x64.
     """
     if isinstance(value, bool) or not _is_number(value):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python float, got {value!r} ({kind}).")
-    if not (math.isfinite(value) and low <= value <= high):
+    if not (abs(value) <= _LARGEST and low <= value <= high):
         valid = f"in [{low:g}, {high:g}]"
         if high == math.inf:
             valid = f"finite and at least {low:g}"

@@ -118,13 +118,17 @@ def from_json(text: str) -> tuple[Coordinate, ...]:
     Raises:
       TypeError, ValueError: if the text is no such list, or `space` would refuse it.
     """
-    found = json.loads(text)
+    try:
+        found = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("text must be a list of objects, got a deeper one.") from error
     fields = set(Coordinate._fields)
     if not isinstance(found, list) or not all(_has(row, fields) for row in found):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
         wanted = ", ".join(Coordinate._fields)
         raise ValueError(f"text must be a list of objects with {wanted}, got {text!r}.")
     rows = tuple(Coordinate(**row) for row in found)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     _check(rows)
+    _blocks(rows)
     return rows
 
 

@@ -63,7 +63,10 @@ def append(
     rows = (dataset.cursor + jnp.arange(length, dtype=jnp.int32)) % capacity
     added: int | Array = length
     if count is not None:
-        added = jnp.clip(count, 0, length)
+        is_whole = jnp.issubdtype(jnp.result_type(count), jnp.integer)
+        if jnp.shape(count) or not is_whole:
+            raise TypeError(f"count must be int32[], got {count!r}.")
+        added = jnp.clip(count, 0, length).astype(jnp.int32)
         # Beyond the last row nothing is written.
         rows = jnp.where(jnp.arange(length) < added, rows, capacity)
     data = Transition(

@@ -111,9 +111,9 @@ def build_trials(
         good = said.value > WORST_VALUE / 1e3
         counts = good.astype(jnp.float32)
         value = jnp.where(good, said.value, 0.0)
-        # Where the state is not finite, no weight of 0 would mask what was seen.
-        known = jnp.where(good[..., None], seen, 0.0)
-        state = keep(state, Plans(known, wanted, value, counts))
+        # No weight of 0 would mask what is not finite.
+        known, taught = (jnp.where(good[..., None], x, 0.0) for x in (seen, wanted))
+        state = keep(state, Plans(known, taught, value, counts))
         again = jax.random.uniform(again_key, rows, jnp.float32) < config.restart
         again |= ~(steps.counts[0] & steps.goes_on[0])
         obs, rewards, planning = renewed(

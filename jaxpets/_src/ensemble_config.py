@@ -46,7 +46,7 @@ class EnsembleConfig:
 
     def __post_init__(self) -> None:
         check_count("num_members", self.num_members)
-        check_counts("hidden_sizes", self.hidden_sizes)
+        keep_checked(self, "hidden_sizes", check_counts)
         num_layers = len(self.hidden_sizes) + 1
         keep_checked(self, "weight_decays", _check_decays, num_layers)
         keep_checked(self, "bound_decay", check_real, 0.0)

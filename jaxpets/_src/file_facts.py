@@ -133,11 +133,18 @@ def space_from_json(
     return space
 
 
-def check_no_nan(where: str, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises if there is a NaN."""
+def check_numbers(where: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises for numbers with which a network computes none.
+
+    A range of which nothing was seen has infinite bounds.
+    """
     for name, array in arrays.items():
         if np.isnan(array).any():
             raise ValueError(f"{name} of {where} must have no NaN.")
+        if name not in ("scaler.low", "scaler.high") and np.isinf(array).any():
+            raise ValueError(f"{name} of {where} must be finite.")
+        if name.split(".")[-1] == "std" and (array <= 0).any():
+            raise ValueError(f"{name} of {where} must be positive.")
 
 
 def _no_constant(text: str) -> NoReturn:

@@ -123,7 +123,8 @@ def reward(formula: Formula, obs: Array, action: Array, next_obs: Array) -> Arra
 
     Returns:
       `[...]`, in the unit of the formula. Where it has no value, as at a division by
-      zero, it is not finite, which `plan` rejects.
+      zero or where an entry that it reads is not finite, neither is it, which `plan`
+      rejects.
 
     Raises:
       TypeError: if formula is not a Formula.
@@ -166,7 +167,21 @@ def reward(formula: Formula, obs: Array, action: Array, next_obs: Array) -> Arra
         filled(_at(next_obs, formula.entries[k], -1)) for k in range(MAX_ENTRIES)
     ]
     work = [jnp.zeros(shape, jnp.float32)] * WORK_REGISTERS
-    return _LAX.fori_loop(0, formula.size, step, jnp.stack(work + entries))[0]
+    result = _LAX.fori_loop(0, formula.size, step, jnp.stack(work + entries))[0]
+    # Comparisons would answer for a NaN, too.
+    known = [
+        jnp.isfinite(entry) | ~is_read
+        for entry, is_read in zip(entries, _are_read(formula), strict=True)
+    ]
+    return jnp.where(functools.reduce(jnp.logical_and, known), result, jnp.nan)
+
+
+def _are_read(formula: Formula) -> Array:
+    """Tells `[MAX_ENTRIES]` which entries a formula reads; slots without one hold 0."""
+    is_load = formula.opcodes < len(LOADS)
+    registers = jnp.where(is_load[:, None], 0, formula.operands)
+    slots = WORK_REGISTERS + jnp.arange(MAX_ENTRIES, dtype=jnp.int32)
+    return jnp.any(registers[..., None] == slots, axis=(0, 1))
 
 
 def _at(row: Array, place: Array, axis: int) -> Array:

@@ -59,6 +59,8 @@ class Program:
         """Returns the program of a tree; call it once."""
         if tree.name == "entry":  # the result must be in the first register
             tree = Node("copy", tree.column, (tree,))
+        if _num_operations(tree, {}) > MAX_OPERATIONS:
+            fail(f"This is longer than {MAX_OPERATIONS} operations.", tree.column)
         self._write(tree, 0)
         entries = np.zeros(MAX_ENTRIES, np.int32)
         entries[: len(self._entries)] = self._entries
@@ -82,8 +84,6 @@ class Program:
         for i in order:
             operands[i] = self._write(node.parts[i], held)
             held += operands[i] < WORK_REGISTERS
-        if self._size == MAX_OPERATIONS:
-            fail(f"This is longer than {MAX_OPERATIONS} operations.", node.column)
         if free >= WORK_REGISTERS:
             fail("This is nested too deeply.", node.column)
         here = self._size
@@ -102,6 +102,17 @@ class Program:
                 fail(f"This is the name after {MAX_ENTRIES} others.", node.column)
             self._entries.append(node.place)
         return self._entries.index(node.place)
+
+
+def _num_operations(node: Node, known: dict[int, int]) -> int:
+    """Returns how many operations a tree is, of which shared parts count each time.
+
+    Comparisons in a chain share sides: each in the next doubles what would be written.
+    """
+    if id(node) not in known:
+        parts = sum(_num_operations(part, known) for part in node.parts)
+        known[id(node)] = parts + (node.name != "entry")
+    return known[id(node)]
 
 
 def _need(node: Node) -> int:

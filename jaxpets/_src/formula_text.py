@@ -99,7 +99,7 @@ def _places(name: str, words: Any) -> Mapping[str, int]:
     found = cast(Mapping[str, int], words)
     for word, place in found.items():
         check_text(f"a word of {name}", word)
-        check_count(f"{name}[{word!r}]", place, minimum=0)
+        check_count(f"{name}[{word!r}]", place, 0, 2**31 - 1)
     return found
 
 

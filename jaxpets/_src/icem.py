@@ -94,7 +94,8 @@ def icem(
         mean, and leave the surplus out: it takes longer to run, the more the steeper
         the decay, and a model's noise is another draw.
       keep_candidates: return all sequences that were tried, with their values, in
-        `Solution.candidates`; for drawing them.
+        `Solution.candidates`; for drawing them. In a loop those are among them that
+        `unroll` leaves out.
 
     Returns:
       A TrajectoryOptimizer.

@@ -65,7 +65,7 @@ def save_model(
     arrays = {
         name: np.asarray(array) for name, array in tensor_file.named(params).items()
     }
-    file_facts.check_no_nan("params", arrays)
+    file_facts.check_numbers("params", arrays)
     facts = {
         "config": _config_to_json(config),
         "obs_size": model.obs_size,
@@ -118,7 +118,7 @@ def load_model(
             file, f"its networks read {found} numbers, but get {num_inputs}"
         )
     arrays = file.arrays()
-    file_facts.check_no_nan(str(file.path), arrays)
+    file_facts.check_numbers(str(file.path), arrays)
     leaves = [
         jnp.asarray(arrays[name], jnp.float32) for name in tensor_file.named(template)
     ]
@@ -186,6 +186,10 @@ def _check_sizes(
     wanted: dict[str, tuple[int, ...]]
     if len(inputs) != 1:
         file_facts.refuse(file, f"scaler.mean must be of one axis, got {inputs}")
+    if facts["action_size"] > inputs[0]:
+        file_facts.refuse(
+            file, f"action_size must be at most {inputs[0]}, what it reads"
+        )
     wanted = {f"scaler.{name}": inputs for name in ("mean", "std")}
     wanted |= {f"scaler.{name}": obs for name in ("low", "high")}
     wanted |= {f"network.{name}": obs for name in ("min_logvar", "max_logvar")}

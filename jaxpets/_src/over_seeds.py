@@ -80,6 +80,12 @@ def _check_state(state: Any, num_seeds: int) -> None:
     """Raises unless all but what the seeds share is of so many."""
     check_record("state", state, LearnerState)
     check_record("state.dataset", state.dataset, Dataset)
+    for name in ("size", "cursor"):
+        if shape := jnp.shape(getattr(state.dataset, name)):
+            raise ValueError(
+                f"state.dataset.{name} must be [], which the seeds share (SEED_AXES), "
+                f"got the shape {shape}."
+            )
     own = state.dataset._replace(size=None, cursor=None)
     _check_seeds("state", state._replace(dataset=own), num_seeds)
 

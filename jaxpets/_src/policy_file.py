@@ -57,7 +57,7 @@ def save_policy(
     template = _template(networks, space, obs_size, box, kernel.shape[0])
     check_like("params", params, template)
     arrays = {name: np.asarray(x) for name, x in tensor_file.named(params).items()}
-    file_facts.check_no_nan("params", arrays)
+    file_facts.check_numbers("params", arrays)
     facts = {
         "space": file_facts.space_to_json(space),
         "obs_size": obs_size,
@@ -120,7 +120,7 @@ def load_policy(
     added = {"squash": np.zeros(())} if "squash" not in file.shapes else {}
     file_facts.check_arrays(file, {n: names[n].shape for n in names if n not in added})
     arrays = {**file.arrays(), **added}
-    file_facts.check_no_nan(str(file.path), arrays)
+    file_facts.check_numbers(str(file.path), arrays)
     leaves = [jnp.asarray(arrays[name], jnp.float32) for name in names]
     structure = cast(Any, jax.tree.structure(template))
     return networks.policy, cast(

@@ -79,7 +79,10 @@ def to_onnx(
     bias = layers["Dense_2"]["bias"]
     check_array("the last bias of params.actor", bias, [box.center.shape[0]])
     graph = _Graph()
-    parts = ["obs"]
+    # An entry that is not read may be anything: times 0, a NaN would be one.
+    plain = np.flatnonzero(read.matrix[:obs_size].any(1)).tolist()
+    read_rows = np.concatenate([read.matrix[plain], read.matrix[obs_size:]])
+    parts = [graph.entries(plain)] if plain else []
     if read.angles:
         angle = graph.entries(read.angles)
         parts += [graph.node("Sin", angle), graph.node("Cos", angle)]
@@ -89,15 +92,15 @@ def to_onnx(
     if goal_size:
         parts.append("task")
     x = graph.node("Concat", *parts, axis=1) if len(parts) > 1 else parts[0]
-    # Whitening is linear, too.
-    size = read.matrix.shape[0] + goal_size
+    size = read_rows.shape[0] + goal_size
     matrix = np.zeros((size, mean.shape[0]), np.float32)
-    matrix[: size - goal_size, : mean.shape[0] - goal_size] = read.matrix
+    matrix[: size - goal_size, : mean.shape[0] - goal_size] = read_rows
     matrix[size - goal_size :, mean.shape[0] - goal_size :] = np.eye(goal_size)
     offset = np.concatenate([read.offset, np.zeros(goal_size, np.float32)])
-    x = graph.node(
-        "Gemm", x, graph.array(matrix / std), graph.array((offset - mean) / std)
-    )
+    x = graph.node("Gemm", x, graph.array(matrix), graph.array(offset))
+    # Not part of the product: digits are lost where the mean is large beside the std.
+    x = graph.node("Sub", x, graph.array(mean))
+    x = graph.node("Div", x, graph.array(std))
     x = graph.node("Clip", x, graph.array(-CLIP), graph.array(CLIP))
     for i in range(2):
         x = graph.dense(x, layers[f"Dense_{i}"])

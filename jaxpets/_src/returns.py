@@ -14,22 +14,22 @@ from jaxpets._src.types import RewardFn
 ReturnsFn = Callable[[Any, Array, Array], Array]
 
 
-def checked_reward(reward_fn: RewardFn) -> RewardFn:
+def checked_reward(reward_fn: RewardFn, name: str = "reward_fn") -> RewardFn:
     """Returns reward_fn with a check, when traced, of what it returns."""
-    check_callable("reward_fn", reward_fn)
+    check_callable(name, reward_fn)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         particles = obs.shape[:-1]
         reward = reward_fn(params, obs, action, next_obs)
         if not hasattr(reward, "dtype") and not isinstance(reward, (int, float)):
             kind = type(reward).__name__
-            raise TypeError(f"reward_fn must return an array, got {kind}.")
+            raise TypeError(f"{name} must return an array, got {kind}.")
         reward = jnp.asarray(reward)
         if reward.dtype != jnp.float32:
-            raise TypeError(f"reward_fn must return float32, got {reward.dtype}.")
+            raise TypeError(f"{name} must return float32, got {reward.dtype}.")
         if reward.shape not in ((), particles):
             raise ValueError(
-                f"reward_fn must return shape () or {particles}, got {reward.shape}."
+                f"{name} must return shape () or {particles}, got {reward.shape}."
             )
         return reward
 

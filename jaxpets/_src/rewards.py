@@ -13,6 +13,7 @@ from jaxpets._src.checks import (
     check_real,
     check_record,
 )
+from jaxpets._src.returns import checked_reward
 from jaxpets._src.types import RewardFn
 
 
@@ -145,13 +146,14 @@ def mixture(extrinsic_fn: RewardFn, intrinsic_fn: RewardFn) -> RewardFn:
 
     Returns:
       A RewardFn whose params are MixtureData. It returns `[]` if both do, else
-      `[E, P]`. It raises TypeError or ValueError for other params.
+      `[E, P]`. It raises TypeError or ValueError for other params, and if a part
+      returns anything else.
 
     Raises:
       TypeError: unless both are functions.
     """
-    check_callable("extrinsic_fn", extrinsic_fn)
-    check_callable("intrinsic_fn", intrinsic_fn)
+    extrinsic_fn = checked_reward(extrinsic_fn, "extrinsic_fn")
+    intrinsic_fn = checked_reward(intrinsic_fn, "intrinsic_fn")
 
     def reward(
         params: MixtureData, obs: Array, action: Array, next_obs: Array

@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, cast
 
 import jax.numpy as jnp
@@ -200,7 +200,10 @@ def _host_function(
                 pool.submit(visit_rows, rows[i::count], buffers[i])
                 for i in range(1, count)
             ]
-            visit_rows(rows[::count], buffers[0])
+            try:
+                visit_rows(rows[::count], buffers[0])
+            finally:
+                wait(others)  # none has scratch of the next call
             for other in others:
                 other.result()
 

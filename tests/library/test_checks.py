@@ -37,7 +37,7 @@ def test_real_refuses_what_is_out_of_range(value):
 
 
 def test_real_without_a_greatest_value_says_so():
-    for value in (-1.0, float("inf")):
+    for value in (-1.0, float("inf"), 1e39, 10**400):  # float32 holds neither
         with pytest.raises(ValueError, match="decay must be finite and at least 0"):
             checks.check_real("decay", value, 0.0)
 
@@ -244,3 +244,13 @@ def test_a_record_in_place_of_a_function_is_named_with_its_functions():
         jaxpets.particle_rollout(model)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"a function, got PlanParams\.$"):
         checks.check_callable("dynamics_fn", jaxpets.PlanParams((), ()))
+
+
+def test_an_action_box_is_not_the_callers_memory():
+    memory = np.zeros(32, np.float32)
+    start = (-memory.ctypes.data % 64) // 4  # an array that JAX could take as it lies
+    high = memory[start : start + 1]
+    high[:] = 1.0
+    box = action_box(-np.ones(1, np.float32), high)
+    high[:] = 5.0
+    assert float(box.high[0]) == 1.0

@@ -172,6 +172,11 @@ def test_other_text_is_refused(text):
         coordinates.from_json(text)
     with pytest.raises(ValueError, match="kind of entry 'x' must be one of relative"):
         coordinates.from_json(coordinates.to_json([Coordinate("x", "round")]))
+    three = [Coordinate(x, "quaternion", is_bounded=False) for x in "xyz"]
+    with pytest.raises(ValueError, match="a quaternion must be 4 like rows"):
+        coordinates.from_json(coordinates.to_json(three))
+    with pytest.raises(ValueError, match="text must be a list of objects, got a deep"):
+        coordinates.from_json("[" * 100_000)
 
 
 BAD = {

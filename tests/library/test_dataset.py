@@ -74,6 +74,13 @@ def test_no_more_rows_are_counted_than_there_are(count, wanted):
     assert toys.avals(after) == toys.avals(dataset)
 
 
+@pytest.mark.parametrize("count", [jnp.float32(2.5), jnp.arange(3), jnp.array(True)])
+def test_rows_are_counted_by_one_integer(count):
+    dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
+    with pytest.raises(TypeError, match=r"count must be int32\[\], got"):
+        append(dataset, numbered(1, 3), count)
+
+
 def test_one_trace_while_it_grows():
     append = jax.jit(functools.partial(jaxpets.datasets.append))  # a cache of its own
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)

@@ -188,6 +188,23 @@ def test_a_search_without_a_finite_plan_teaches_nothing():
     assert all(jax.tree.leaves(same))
 
 
+def test_a_plan_without_an_action_costs_no_step():
+    """As a planner of one's own may have it, where `plan` keeps one that is finite."""
+
+    def step(params, key, state, obs):
+        output, state = PLANNER.step(params, key, state, obs)
+        is_lost = obs[0] > 0
+        lost = jax.tree.map(lambda x: jnp.where(is_lost, jnp.nan, x), output)
+        return lost, state
+
+    distiller = build(planner=jaxpets.Planner(PLANNER.init, step), num_updates=3)
+    known, data = PlanParams(GAIN, TARGETS), states()
+    before = jax.jit(distiller.init)(known, jax.random.key(0), data)
+    after, metrics = jax.jit(distiller.step)(known, jax.random.key(1), before, data)
+    assert metrics.num_skipped == 0 and jnp.isfinite(metrics.error)
+    assert 0 < float(after.plans.counts.sum()) < int(after.size)
+
+
 def test_a_state_that_is_not_finite_costs_no_step():
     """It was kept with a weight of 0, of which NaN is not masked."""
     data = states()

@@ -1,5 +1,7 @@
 """Rewards as text: what they mean, what is refused, and that nothing is compiled."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -170,6 +172,8 @@ def test_random_formulas_equal_numpy(run, text):
         ("abs(x=1)", "without names", 0),
         ("abs(*velocity)", "and not this", 4),
         ("1" + " + 1" * 40, "longer than 64 operations", 0),
+        # Written out, each of these comparisons is twice as long as the one in it.
+        ("1<(" * 60 + "velocity" + ")<1" * 60, "longer than 64 operations", 0),
         ("x" * 1001, "at most 1000 characters, not 1001", 1000),
         ("-" * 999 + "1", "", None),
         ("(" * 400 + "1" + ")" * 400, "", None),
@@ -285,6 +289,22 @@ def test_formulas_map_and_serve_particles(run):
     effort = VARIABLES["effort"]
     expected[4] += 0.1 * (effort[:6] - effort[0]).reshape(2, 3)
     np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text", ["not velocity < 1", "velocity ** 0", "-(velocity < 1)"]
+)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_where_an_entry_has_no_value_neither_has_a_formula_of_it(run, text, bad):
+    """A comparison alone would say 0 or 1, which might be the best there is."""
+    reward = jax.jit(functools.partial(formulas.reward))  # a cache of its own
+    rows = jnp.asarray(NEXT_OBS).at[::2, NAMES["velocity"]].set(bad)
+    value = reward(parse(text), rows, ACTION, rows)
+    assert np.isnan(value[::2]).all()
+    np.testing.assert_array_equal(value[1::2], run(parse(text))[1::2])
+    other = parse("height + action_1")  # which does not read it
+    value = reward(other, rows, ACTION, rows)
+    np.testing.assert_array_equal(value, run(other))
 
 
 def test_a_planner_takes_any_formula_without_compiling_again():

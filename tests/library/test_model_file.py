@@ -158,6 +158,14 @@ METADATA = {
     "a list": (lambda saved: {"model": "[]"}, "must be an object"),
     "a key less": (lambda saved: {"model": '{"space": 1}'}, "config, obs_size, .*got"),
     "config": (lambda saved: {"model": facts(saved, config={"x": 1})}, "its config"),
+    "huge": (
+        lambda saved: {"model": facts(saved, config={"bound_decay": 10**400})},
+        "its config",
+    ),
+    "actions": (
+        lambda saved: {"model": facts(saved, action_size=2**63)},
+        "action_size must be at most",
+    ),
     "no number": (lambda saved: {"model": facts(saved, obs_size="2")}, "obs_size"),
     "too large": (
         lambda saved: {"model": facts(saved, obs_size=10**15)},
@@ -200,7 +208,7 @@ def test_a_file_that_says_too_much_of_itself_is_refused(saved, tmp_path):
         models.about(path)
 
 
-BIAS = "network.members.params.layer_0.bias"
+BIAS, STD = "network.members.params.layer_0.bias", "scaler.std"
 ARRAYS = {
     "missing": (lambda x: {k: v for k, v in x.items() if k != BIAS}, BIAS),
     "one more": (lambda x: x | {"payload": x[BIAS]}, "payload"),
@@ -211,6 +219,8 @@ ARRAYS = {
     ),
     "kind": (lambda x: x | {BIAS: x[BIAS].astype(np.int64)}, "dtype of F32"),
     "NaN": (lambda x: x | {BIAS: x[BIAS] * np.float32("nan")}, "must have no NaN"),
+    "infinite": (lambda x: x | {BIAS: x[BIAS] + np.float32("inf")}, "must be finite"),
+    "no width": (lambda x: x | {STD: 0 * x[STD]}, "std of .* must be positive"),
     "axes": (lambda x: x | {"scaler.mean": x[BIAS]}, "scaler.mean must be of one axis"),
 }
 

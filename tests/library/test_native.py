@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -265,6 +266,24 @@ def test_callers_in_threads_take_turns(env, states, actions, after):
         found = list(pool.map(lambda _: step(states, actions), range(12)))
     for got in found:
         assert_same(got, after)
+
+
+def test_no_thread_works_on_after_an_error(model):
+    """What it works in is another's as soon as the next call begins."""
+    running = []
+
+    def visit(row, data):
+        if row[1] == 1:
+            raise ValueError("no way")
+        running.append(1)
+        time.sleep(0.02)
+        running.pop()
+
+    call = native._host_function(model, visit, 1, 3)
+    rows = jnp.zeros((48, 1)).at[0].set(1)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no way"):
+        jax.block_until_ready(jax.vmap(call)(rows))
+    assert not running
 
 
 def test_all_cores_are_the_default(monkeypatch):

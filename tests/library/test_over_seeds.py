@@ -167,6 +167,10 @@ def test_there_are_as_many_states_and_transitions_as_seeds(num_seeds):
     shared = state._replace(reward=jax.ShapeDtypeStruct((), jnp.float32))
     with pytest.raises(ValueError, match=r"state\.reward must .* got the shape \(\)"):
         learn(keys, shared, rows)
+    size = jax.ShapeDtypeStruct((num_seeds,), jnp.int32)  # as jax.vmap would have it
+    apart = state._replace(dataset=state.dataset._replace(size=size))
+    with pytest.raises(ValueError, match=r"state\.dataset\.size must be \[\], which"):
+        learn(keys, apart, rows)
 
 
 # -- buffers -------------------------------------------------------------------------

@@ -86,6 +86,26 @@ def test_onnxruntime_acts_as_jax_does(name, sees):
     np.testing.assert_allclose(session.run(None, one)[0], wanted[:1], atol=1e-4)
 
 
+def test_onnxruntime_reads_what_jax_reads_and_no_more():
+    """Entries that are no inputs may be anything, and others far from 0."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    space, obs_size = SPACES["turning"]
+    policy, params, obs = policy_of(space, obs_size, policies.Goals())
+    # z is 100 m, give or take a millimetre.
+    params = params._replace(
+        mean=params.mean.at[0].set(100.0), std=params.std.at[0].set(1e-3)
+    )
+    obs = obs.at[:, 0].set(jnp.nan).at[:, 1].set(100.0 + 1e-3 * obs[:, 1])
+
+    def act(obs):
+        known = PlanParams((), policies.Guided(jnp.float32(0.0), params))
+        return policy.step(known, jax.random.key(0), (), obs)[0].action
+
+    content = policies.to_onnx(params, space, obs_size=obs_size, **BOX)
+    (found,) = onnxruntime.InferenceSession(content).run(None, {"obs": np.asarray(obs)})
+    np.testing.assert_allclose(found, jax.jit(jax.vmap(act))(obs), atol=1e-5)
+
+
 def test_what_onnx_cannot_hold_is_refused():
     pytest.importorskip("onnx")
     space, size = SPACES["cheetah"]

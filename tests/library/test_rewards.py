@@ -232,6 +232,12 @@ def test_a_mixture_refuses_what_does_not_fit():
         mixture(first, epistemic)((1.0, base), *step)
     with pytest.raises(ValueError, match=r"params.weight must be float32\[\], got"):
         mixture(first, epistemic)(MixtureData(1.0, base, jnp.ones(2)), *step)
+    data = MixtureData(1.0, base, jnp.float32(1))
+    with pytest.raises(ValueError, match=r"intrinsic_fn must return shape \(\) or"):
+        mixture(first, lambda *_: jnp.ones(P))(data, *step)
+    with pytest.raises(TypeError, match="extrinsic_fn must return float32, got bool"):
+        mixture(lambda *_: jnp.array(True), epistemic)(data, *step)
+    assert mixture(lambda *_: 0.0, epistemic)(data, *step).shape == ()
 
 
 def test_namespace_lists_what_it_has():
