@@ -166,6 +166,9 @@ def _explored(config: Config) -> Config:
     # What an older version did not write is that of the run's own preset, arm and
     # robot, not of those that happen to be said again.
     own = from_json(data, config, str(path))
+    phase = data.get("phase", "explore")
+    valid = f"an exploration; name the run that it began with, as {folder.parent}"
+    require(phase == "explore", "--from", folder, valid)
     if "critic" not in data.get("distill", {}):
         data.pop("distill", None)  # another recipe, which no exploration depends on
     explored = from_json(data, preset_config(own.preset, own.arm, own.env), str(path))

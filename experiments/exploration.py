@@ -18,6 +18,7 @@ from .errors import UsageError
 from .presets import PRESETS
 from .storage import rundir
 from .storage.folder import RunFolder
+from .validate import require
 
 
 def config_of(run: RunFolder) -> Config:
@@ -40,9 +41,11 @@ def without_files(config: Config, env: str | None, run: Path) -> Config:
       run: its folder.
 
     Raises:
-      UsageError: if the robot is of a file that it does not name.
+      UsageError: if the robot is of a file that it does not name, or another one.
     """
     user_files.check_named("--env", env, config.env, run / rundir.CONFIG)
+    valid = f"{config.env}, the robot of {run}"
+    require(env in (None, config.env), "--env", env, valid)
     return dataclasses.replace(config, arm="random", tasks=None)
 
 

@@ -90,6 +90,13 @@ def jobs(sweep: Sweep) -> Iterator[Job]:
     Raises:
       UsageError: if there is no name for a run, or a value is not one of a flag.
     """
+    for where in (*(x.grid for x in sweep.where), *(_split(x)[0] for x in sweep.then)):
+        for name in where:
+            if name not in sweep.grid:
+                raise UsageError(
+                    f"grid.{name} of where or then is not valid; the grid has "
+                    f"{', '.join(sweep.grid) or 'nothing'}."
+                )
     for values in itertools.product(*sweep.grid.values()):
         place = dict(zip(sweep.grid, values, strict=True))
         flags = _flat(sweep.flags)

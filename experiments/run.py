@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import calling, cli, robots, signals
+from . import calling, cli, robots, signals, user_files
 from .config import Config
 from .cost import check_cpu, memory_advice
 from .entries import differences, from_json, to_json
@@ -134,6 +134,9 @@ def _opened(
         if distributed.is_first() and not distributed.is_alone():
             late.seconds += 0.5  # the others first: jax aborts them when this one goes
         late.tell = run.interrupted
+        files = (config.env, config.arm, config.tasks, config.policy)
+        for line in run.computes(**user_files.digests(files)):
+            run.say(f"warning: {line}; what was computed before is kept as it is")
         yield run
 
 

@@ -13,11 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from . import calling, cli, grid, robots, run, signals, status
-from .config import Config
-from .entries import differences, to_json
+from . import calling, grid, remaining, robots, run, signals, status
 from .errors import (
-    CheckpointError,
     InterruptedRun,
     RunError,
     UsageError,
@@ -25,8 +22,7 @@ from .errors import (
     storage_errors,
 )
 from .grid import Job, Sweep
-from .storage import disk, rundir
-from .storage.status import COMPLETE, read
+from .storage import disk
 
 _EPILOG = """
 A sweep is a file like this:
@@ -108,13 +104,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--jobs {args.jobs} is not valid; it must be 1 or more.")
     try:
         sweep = grid.read(args.file)
-        jobs = [job for job in _named(sweep) if args.only in job.name]
+        jobs = [job for job in remaining.named(sweep) if args.only in job.name]
         if not jobs:
             raise UsageError(f"--only {args.only} is not valid; no run is called so.")
         if args.run is not None:
             return _run(jobs, args.run)
         with robots.without_gl():
-            left = _left(sweep, jobs)
+            left = remaining.left(sweep, jobs)
         print(f"{len(jobs)} runs, {len(jobs) - len(left)} of them complete", flush=True)
         if args.list:
             for job in jobs:
@@ -138,45 +134,6 @@ def _run(jobs: Sequence[Job], name: str) -> int:
         if job.name == name:
             return next(filter(None, map(run.main, job.commands)), 0)
     raise UsageError(f"--run {name} is not valid; there is no such run.")
-
-
-def _named(sweep: Sweep) -> list[Job]:
-    """Returns all runs; each must have a name of its own."""
-    jobs = list(grid.jobs(sweep))
-    if len({job.name for job in jobs}) < len(jobs):
-        raise UsageError("grid is not valid; two of its runs have one name.")
-    return jobs
-
-
-def _left(sweep: Sweep, jobs: Sequence[Job]) -> list[Job]:
-    """Returns the runs that are not complete; what is not valid is refused first."""
-    out = Path(sweep.out)
-    return [job for job in jobs if not _complete(out / job.name, job.commands)]
-
-
-def _complete(folder: Path, commands: Sequence[Sequence[str]]) -> bool:
-    explored = cli.parse(commands[0])
-    whole = _is_complete(folder, explored, explored.num_trials)
-    for command in commands[1:]:
-        try:
-            config = cli.parse(command)
-        except CheckpointError:  # nothing is explored yet
-            cli.parse(command, explored)
-            whole = False
-        else:
-            step = explored.num_trials if config.at_trial is None else config.at_trial
-            whole &= _is_complete(folder / cli.variant(config, step), config, None)
-    return whole
-
-
-def _is_complete(folder: Path, config: Config, trial: int | None) -> bool:
-    if not (folder / rundir.STATUS).is_file():
-        return False
-    began = rundir.find_json(folder / rundir.CONFIG)
-    if differences(began, to_json(config), str(folder / rundir.CONFIG)):
-        return False  # the run itself refuses, and says what differs
-    found = read(folder)
-    return found.state == COMPLETE and trial in (None, found.trial)
 
 
 def _here(

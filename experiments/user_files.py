@@ -5,11 +5,12 @@ stranger, is never reason enough; see `cli`.
 """
 
 import contextlib
+import hashlib
 import os
 import re
 import runpy
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +23,17 @@ _FORM = re.compile(r"(.+\.py)(?::(\w+))?", re.DOTALL)
 def is_file(text: str | None) -> bool:
     """Returns whether a text names a file."""
     return _FORM.fullmatch(text or "") is not None
+
+
+def digests(texts: Iterable[str | None]) -> dict[str, str]:
+    """Returns which files are named, in words, each with a digest of its content."""
+    named = (_FORM.fullmatch(text) or [text, text] for text in texts if text)
+    files = {Path(form[1]) for form in named}
+    return {
+        f"the content of {file}": hashlib.sha256(file.read_bytes()).hexdigest()[:8]
+        for file in sorted(files)
+        if file.suffix and file.is_file()
+    }
 
 
 def check_named(flag: str, said: str | None, found: str, where: Path) -> None:

@@ -120,7 +120,7 @@ def _opened(options: Options) -> tuple[socket.socket, str]:
     port = _PORT if options.port is None else options.port
     try:
         listener = _listener(host, port)
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, UnicodeError) as error:
         if options.host or options.port is not None:
             said = (
                 f"--host {host} with port {port}" if options.host else f"--port {port}"

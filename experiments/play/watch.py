@@ -12,7 +12,7 @@ from viser import uplot
 
 from jaxpets.envs import Robot
 
-from .. import exploration, user_files
+from .. import exploration
 from ..errors import CheckpointError, RunError
 from ..storage import metrics, rundir, status
 from ..storage.folder import RunFolder
@@ -38,8 +38,7 @@ class Watched:
         """
         self.folder = RunFolder(run)
         config = exploration.config_of(self.folder)
-        user_files.check_named("--env", env, config.env, run / rundir.CONFIG)
-        self.env = env or config.env
+        self.env = exploration.without_files(config, env, run).env
         self.seed = config.seeds[0] if seed is None else seed
         if self.seed not in config.seeds:
             raise CheckpointError(f"{run} has no seed {self.seed}.")

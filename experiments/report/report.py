@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..config import UNPLANNED
+from ..errors import UsageError
 from ..storage import disk
 from . import (
     caveats,
@@ -215,7 +216,10 @@ def _ablation(path: Path) -> list[str]:
         "Zero-shot returns, means over seeds and trials. Seeds 100 and 101 are those "
         "on which `best` was chosen; they are in no other table."
     )
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    try:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+    except ValueError as error:
+        raise UsageError(f"{path} holds no rows of an ablation: {error}") from error
     return ["## Ablation", "", text, "", *tables.ablation(rows)]
 
 

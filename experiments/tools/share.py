@@ -14,7 +14,7 @@ from typing import Any
 
 import jaxpets
 
-from .. import exploration, model_file
+from .. import exploration, model_file, user_files
 from ..config import PlannerConfig
 from ..errors import RunError, UsageError, storage_errors
 from ..presets import quick_search
@@ -50,9 +50,10 @@ def share(
     """
     found = exploration.explored(run, seed=seed, env=env)
     config = found.config
+    is_file = user_files.is_file(config.env)
     search = quick_search(config)
     about = {
-        "environment": config.env if env is None else rundir.label(env),
+        "environment": rundir.label(config.env) if is_file else config.env,
         "licence": licence,
         "training": model_file.training(
             RunFolder(run), config, found.seed, found.trial

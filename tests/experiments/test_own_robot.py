@@ -1,6 +1,7 @@
 """A robot, tasks and an objective of the user's, through every phase."""
 
 import json
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -115,6 +116,29 @@ def test_a_file_runs_only_if_the_command_names_it(out, capsys, wanted):
     flags = [x for pair in (ROBOT, ARM) for x in pair if said >= {*pair}]
     assert main(["zero-shot", "--from", str(out / NAME), *flags]) == 2
     assert f"runs only if you name it: {' '.join(wanted)}." in capsys.readouterr().err
+
+
+def test_a_file_that_was_changed_is_told(out, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("near.py").write_text(Path(FILE).read_text())
+    line = ["zero-shot", "--from", str(out / NAME), *ROBOT, *ARM, "--tasks", "near.py"]
+    assert main(line) == 0
+    assert main(line) == 0
+    assert "warning" not in capsys.readouterr().err
+    with Path("near.py").open("a") as file:
+        file.write("# other numbers\n")
+    assert main(line) == 0
+    said = capsys.readouterr().err
+    assert "warning: the content of near.py was " in said and " and is now " in said
+
+
+def test_a_zero_shot_is_no_exploration(out, capsys):
+    folder = out / NAME / "zero-shot-002"
+    assert main(["zero-shot", "--from", str(folder), *ROBOT, *ARM]) == 2
+    words = (
+        f"it must be an exploration; name the run that it began with, as {out / NAME}"
+    )
+    assert words in capsys.readouterr().err
 
 
 def test_a_tool_runs_no_file_that_only_a_run_names(out, tmp_path, capsys):

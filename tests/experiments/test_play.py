@@ -682,6 +682,10 @@ def test_a_port_that_there_is_not_is_refused():
     options = serve.Options("pretrained/best", port=65_536)
     with pytest.raises(UsageError, match="--port 65536 is not to be had"):
         serve._opened(options)
+    with pytest.raises(
+        UsageError, match=r"--host no\.\.such with port .* is not to be"
+    ):
+        serve._opened(serve.Options("pretrained/best", host="no..such"))
 
 
 def test_a_signal_ends_it_at_once():

@@ -302,6 +302,9 @@ def test_the_ablation_is_a_table_of_means_over_seeds_and_trials(plain, out):
     text, table = report_of(out)
     assert "| curiosity | none | CEM | 8 9 | 22 | 25 | 28 | 30 |" in text
     assert "curiosity" not in json.dumps(table)
+    (out / "ablation.jsonl").write_text("{")
+    with pytest.raises(UsageError, match="jsonl holds no rows of an ablation"):
+        report_of(out)
 
 
 def test_null_returns_are_left_out_and_counted(out):

@@ -35,6 +35,18 @@ def test_a_file_predicts_as_its_run(explored, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, got, want)
 
 
+def test_the_robot_is_that_of_the_run(explored, tmp_path, capsys):
+    path = tmp_path / "m.safetensors"
+    robot = ("--env", "pets/half_cheetah")  # as the run has it anyway
+    assert share.main([str(explored), str(path), *robot]) == 0
+    assert models.about(path)["environment"] == robot[1]
+    other = ("--env", "dmc/walker")
+    assert share.main([str(explored), str(tmp_path / "n.safetensors"), *other]) == 2
+    words = "--env dmc/walker is not valid; it must be pets/half_cheetah, the robot of"
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "n.safetensors").exists()
+
+
 def test_half_the_size_is_said(explored, tmp_path):
     path = tmp_path / "m.safetensors"
     assert share.main([str(explored), str(path), "--half"]) == 0

@@ -214,6 +214,12 @@ def test_the_files_of_tables_are_valid(name, monkeypatch):
         (FILE + '[[then]]\nphase = "zero-shot"\neval-trials = 0', "--eval-trials 0"),
         (FILE + '[[then]]\nphase = "zero-shot"\ngrid.arm = 3', "then.grid"),
         (FILE + '[[then]]\nphase = "zero-shot"\nvary.task = []', "then.vary"),
+        (FILE + '[[then]]\nphase = "zero-shot"\ngrid.arms = ["random"]', "grid.arms"),
+        (FILE + "[[where]]\ngrid.envv = [1]\nflags.num-trials = 2", "grid.envv"),
+        (
+            FILE + '[[then]]\nphase = "zero-shot"\n' * 2,
+            "zero-shot-001. Give one of them a tag",
+        ),
     ],
 )
 def test_what_is_not_valid_is_refused_before_anything_runs(
@@ -345,6 +351,15 @@ def test_a_run_is_complete_if_it_is_what_the_file_says(
     (tmp_path / "copy" / performed_once.name).rename(tmp_path / "runs" / "epistemic")
     assert sweep.main([str(file(DONE.replace(old, new, 1))), "--list"]) == 0
     assert f"epistemic  {state}" in capsys.readouterr().out
+
+
+def test_a_run_whose_status_is_torn_is_left(performed_once, file, tmp_path, capsys):
+    runs.copied(performed_once, tmp_path / "copy")
+    (tmp_path / "runs").mkdir()
+    run = (tmp_path / "copy" / performed_once.name).rename(tmp_path / "runs/epistemic")
+    (run / "status.json").write_text('{"state": "run')
+    assert sweep.main([str(file(DONE)), "--list"]) == 0
+    assert "epistemic  left" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
