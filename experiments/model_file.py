@@ -136,6 +136,11 @@ def origin(source: Source) -> dict[str, Any]:
     return {"model": shipped.get(source.path, source.path.name), "refit": refit}
 
 
+def called(env: str) -> str:
+    """Returns what the file of a model or a policy calls a robot."""
+    return rundir.label(env) if user_files.is_file(env) else env
+
+
 def robot_of(model: Model, said: str, env: str | None) -> str:
     """Returns of which robot a model is: what the command line says, or the file.
 

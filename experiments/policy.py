@@ -25,12 +25,11 @@ from jaxpets.policies import (
     to_onnx,
 )
 
-from . import critic, model_file, user_files
+from . import critic, model_file
 from .build import Parts, imagined_end
 from .config import Config
 from .entries import to_json
 from .errors import CheckpointError, UsageError
-from .storage import rundir
 from .storage.folder import RunFolder
 
 
@@ -141,7 +140,7 @@ def _check_about(
 
     Robots of equal sizes have networks of equal shapes.
     """
-    own, wanted = about.get("environment"), _called(env)
+    own, wanted = about.get("environment"), model_file.called(env)
     if own not in (None, wanted):
         raise CheckpointError(f"{path} is a policy of {own}, not of {wanted}.")
     learned = about.get("tasks")
@@ -151,11 +150,6 @@ def _check_about(
             f"{path} is a policy of other tasks: it was learned on {said}, and "
             f"{performed} are performed."
         )
-
-
-def _called(env: str) -> str:
-    """Returns what a file of a policy calls a robot."""
-    return rundir.label(env) if user_files.is_file(env) else env
 
 
 def begun(parts: Parts, found: Policy) -> jaxpets.Planner:
@@ -195,7 +189,7 @@ def export(
       step: trials behind the model.
     """
     env, space = parts.robot.env, parts.robot.space
-    about = {"environment": _called(config.env), "tasks": tasks.names}
+    about = {"environment": model_file.called(config.env), "tasks": tasks.names}
     origin = {**model_file.origin(source), "distill": to_json(config.distill)}
     built: Any = {
         "obs_size": parts.model.obs_size,

@@ -14,11 +14,11 @@ from typing import Any
 
 import jaxpets
 
-from .. import exploration, model_file, user_files
+from .. import exploration, model_file
 from ..config import PlannerConfig
 from ..errors import RunError, UsageError, storage_errors
 from ..presets import quick_search
-from ..storage import disk, rundir
+from ..storage import disk
 from ..storage.folder import RunFolder
 from . import card
 
@@ -50,10 +50,9 @@ def share(
     """
     found = exploration.explored(run, seed=seed, env=env)
     config = found.config
-    is_file = user_files.is_file(config.env)
     search = quick_search(config)
     about = {
-        "environment": rundir.label(config.env) if is_file else config.env,
+        "environment": model_file.called(config.env),
         "licence": licence,
         "training": model_file.training(
             RunFolder(run), config, found.seed, found.trial

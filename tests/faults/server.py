@@ -6,7 +6,7 @@ Reads a request per line from stdin, a JSON object, and answers each with one:
     out      file for what it says on stderr
     root     folder whose file operations meet the fault
     what, at, number   as in fault_arm of shim.c; what 0: no fault
-    listed   file for a list of the operations, or None
+    listed   file for a list of the operations
     signal, after      a signal to send, after seconds; None: none
     limit    seconds until it counts as hung
 
@@ -31,9 +31,7 @@ def child(request: dict[str, Any]) -> NoReturn:
     os.dup2(said, 2)
     os.dup2(os.open(os.devnull, os.O_RDWR), 0)
     os.dup2(0, 1)
-    listed = -1
-    if request["listed"]:
-        listed = os.open(request["listed"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    listed = os.open(request["listed"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     if request["what"]:
         ctypes.CDLL(None).fault_arm(
             request["root"].encode(),

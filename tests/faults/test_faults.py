@@ -45,9 +45,7 @@ def flip_largest(out):
 def test_a_run_goes_on_as_if_it_had_met_nothing(outcomes, kind):
     outcome = outcomes[kind]
     assert outcome.wrong == "", outcome
-    # A signal may come too late. How many operations there are differs from run to run,
-    # as orbax has several at a time: one error may strike what a run can do without.
-    assert outcome.met or kind in ("signal", "error")
+    assert outcome.met or kind == "signal"  # which may come too late
     if kind == "flip":
         assert "warning: checkpoint 2 is damaged" in outcome.said
 
