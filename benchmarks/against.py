@@ -2,8 +2,9 @@
 
 Machines of one kind differ by some per cent, and so do days. What is compared is how
 often a program runs while the plan by the scan, in bf16 and of one seed, runs once: the
-last before it on such a device, in `benchmarks.all` one of the same process. Of both
-the fastest run counts, as a call that is waited for wakes late on some days.
+last before it on such a device and at the same commit, in `benchmarks.all` one of the
+same process. Rows that were timed without it are not compared. Of both the fastest run
+counts, as a call that is waited for wakes late on some days.
 """
 
 import json
@@ -35,11 +36,12 @@ class Pair(NamedTuple):
 
 def pairs(today: Sequence[Row], committed: Iterable[Row]) -> Iterator[Pair]:
     """Yields a pair per row of today that has a time; rows of other devices are new."""
-    before = {
-        _key(row): (row, unit)
-        for row, unit in _with_unit(committed)
-        if row["device"] == today[0]["device"]
-    }
+    before: dict[str, tuple[Row, float | None]] = {}
+    for row, unit in _with_unit(committed):
+        if row["device"] == today[0]["device"]:
+            if unit is not None:
+                before[_key(row)] = row, unit
+            before.setdefault(_key(row), (row, unit))
     for row, unit in _with_unit(today):
         then, unit_then = before.get(_key(row), (None, None))
         speed = None
@@ -82,13 +84,14 @@ def report(today: Sequence[Row], committed: Sequence[Row]) -> list[Row]:
 
 
 def _with_unit(rows: Iterable[Row]) -> Iterator[tuple[Row, float | None]]:
-    """Yields each row that has a time with the plain program's, on that device."""
-    units: dict[str, float] = {}
+    """Yields each row that has a time, with the plain program's if it is known."""
+    units: dict[tuple[str, str | None], float] = {}
     for row in rows:
         if "min_ms" in row:
+            where = row["device"], row.get("git")
             if row["benchmark"] == "plan" and _UNIT.items() <= row["sizes"].items():
-                units[row["device"]] = row["min_ms"]
-            yield row, units.get(row["device"])
+                units[where] = row["min_ms"]
+            yield row, units.get(where)
 
 
 def _key(row: Row) -> str:

@@ -44,6 +44,13 @@ def test_a_device_has_a_plain_program_of_its_own():
     assert pair.committed == alone[0] and pair.speed is None
 
 
+def test_a_row_without_the_plain_program_of_its_commit_is_not_compared():
+    committed = [*COMMITTED, {**row(1.0, "fit", seeds=1), "git": "later"}]
+    today = [plain(10.0), row(2.0, "fit", seeds=1)]
+    (_, pair) = against.pairs(today, committed)
+    assert pair.committed == COMMITTED[1] and pair.speed == 1.0
+
+
 def test_what_became_slower_is_returned_and_all_is_printed(tmp_path, capsys):
     lines = [*COMMITTED, {"benchmark": "accuracy", "device": "card", "sizes": {}}]
     rival = {"name": "rival", "device": "card", "engine": "jit", "dtype": "f32",
@@ -74,7 +81,7 @@ def test_what_is_committed_can_be_measured_against():
     """The newest row of each program beside itself, as if all were of today."""
     path = against.RESULTS / "h200.jsonl"
     committed = [json.loads(line) for line in path.read_text().splitlines()]
-    found = list(against.pairs(committed, committed))
-    known = {pair.row["benchmark"] for pair in found if pair.speed}
+    found = [pair for pair in against.pairs(committed, committed) if pair.speed]
+    known = {pair.row["benchmark"] for pair in found}
     assert {"plan", "fit", "rollout", "env", "trace"} <= known
     assert found[-1].row == found[-1].committed and found[-1].speed == 1.0
