@@ -38,10 +38,9 @@ def pairs(today: Sequence[Row], committed: Iterable[Row]) -> Iterator[Pair]:
     """Yields a pair per row of today that has a time; rows of other devices are new."""
     before: dict[str, tuple[Row, float | None]] = {}
     for row, unit in _with_unit(committed):
-        if row["device"] == today[0]["device"]:
-            if unit is not None:
-                before[_key(row)] = row, unit
-            before.setdefault(_key(row), (row, unit))
+        replaces = unit is not None or _key(row) not in before
+        if row["device"] == today[0]["device"] and replaces:
+            before[_key(row)] = row, unit
     for row, unit in _with_unit(today):
         then, unit_then = before.get(_key(row), (None, None))
         speed = None

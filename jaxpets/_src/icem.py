@@ -165,6 +165,7 @@ def icem(
             return better, (tried if keep_candidates else ())
 
         is_last = jnp.arange(num_iterations) == num_iterations - 1
+        # Of one size: what fills up the smaller ones is the surplus that is left out.
         noise = [jnp.resize(x, (num_samples, *shape)) for x in noises]
         inputs = (keys, jnp.stack(noise), jnp.array(populations, jnp.int32), is_last)
         found, tried = jax.lax.scan(iterate, found, inputs)
