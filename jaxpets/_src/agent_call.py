@@ -1,7 +1,7 @@
 """How an agent calls a step: numbers of the host go in, and an action comes back."""
 
 import ctypes
-import time
+import os
 from typing import Any, NamedTuple
 
 import jax
@@ -48,10 +48,11 @@ def first_state(planner: Planner, lead: tuple[int, ...], places: Places | None) 
     """Returns a planner's state with the leading axes of its worlds, in its place.
 
     A step returns it there; if it began elsewhere, the second step would compile anew.
+    It is a copy, as a step may take its memory, and a planner may keep what it gives.
     """
 
     def every(leaf: Any) -> Array:
-        return jnp.broadcast_to(leaf, (*lead, *jnp.shape(leaf)))
+        return jnp.array(jnp.broadcast_to(leaf, (*lead, *jnp.shape(leaf))))
 
     state = jax.tree.map(every, planner.init())
     return jax.device_put(state, places.device if places else None)
@@ -81,9 +82,12 @@ class Mailbox:
 
     XLA takes long to bring a few numbers to a GPU, and to say that a program has ended:
     see "A plan that is waited for" in benchmarks/README.md. Here the host writes what
-    is given into pinned memory, from where the program reads it. The action comes into
-    an array that each call gives to the next, filled with a NaN of its own, and is
-    there once all of that has been replaced.
+    is given into pinned memory, all in one array, from where the program reads it. The
+    action comes into an array that each call gives to the next, filled with a NaN of
+    its own, and is there once all of that has been replaced.
+
+    A call takes the memory of the state that it gets. So all numbers of a program are
+    where they were in the call before, and XLA can start its CUDA graph as it is.
 
     That an action is written once, when it is known, is so where the program has its
     other numbers elsewhere: of GPUs and not of a CPU, where it may work in that array.
@@ -91,15 +95,18 @@ class Mailbox:
 
     def __init__(self, act: ActFn, places: Places) -> None:
         def program(
-            slot: Array, params: PlanParams, key: Array, state: Any, given: Given
+            slot: Array, state: Any, params: PlanParams, key: Array, words: Array
         ) -> tuple[Array, Any]:
             del slot  # its memory is the action's
-            given = jax.device_put(given, jax.memory.Space.Device)
-            return act(params, key, state, given)
+            words = jax.device_put(words, jax.memory.Space.Device)
+            return act(params, key, state, _unpacked(words))
 
         self._act, self._host = act, places.host
         self.program: Any = jax.jit(
-            program, donate_argnums=0, keep_unused=True, out_shardings=tuple(places)
+            program,
+            donate_argnums=(0, 1),
+            keep_unused=True,
+            out_shardings=tuple(places),
         )
         # The slot and what is given, each with a view of it; None while it is not known
         # who reads and writes there.
@@ -108,19 +115,18 @@ class Mailbox:
     def __call__(
         self, params: PlanParams, key: Array, state: Any, given: Given
     ) -> tuple[np.ndarray, Any]:
-        """Returns what Direct does."""
+        """Returns what Direct does. The state that it gets is gone after that."""
         boxes, self._boxes = self._boxes, None
         if boxes is None:
             action, _ = jax.eval_shape(self._act, params, key, state, given)
             zeros = np.zeros(action.shape, action.dtype)
-            boxes = self._shared(zeros), self._shared(given)
-        (slot, action), (inputs, views) = boxes
+            boxes = self._shared(zeros), self._shared(_packed(given))
+        (slot, action), (inputs, view) = boxes
         slot.block_until_ready()  # the call before has ended, and reads no more
-        for view, value in zip(views, given, strict=True):
-            view[...] = value
+        view[...] = _packed(given)
         words = action.reshape(-1).view(np.uint32)
         words[:] = _UNSEEN
-        slot, state = self.program(slot, params, key, state, inputs)
+        slot, state = self.program(slot, state, params, key, inputs)
         if slot.unsafe_buffer_pointer() != action.ctypes.data:
             action = _seen(slot.block_until_ready())  # XLA has put it elsewhere
             words = words[:0]
@@ -129,16 +135,30 @@ class Mailbox:
             if has_ended:
                 return np.array(slot), state  # which raises what has failed
             has_ended = slot.is_ready()
-            time.sleep(0)  # lets other threads of Python go on
-        self._boxes = (slot, action), (inputs, views)
+            os.sched_yield()  # lets other threads of Python go on
+        self._boxes = (slot, action), (inputs, view)
         return action.copy(), state
 
-    def _shared(self, numbers: Any) -> tuple[Any, Any]:
-        """Returns numbers in that memory, and the same as arrays of NumPy."""
-        own = jax.tree.map(np.array, numbers)  # a CPU may take them as they lie
-        arrays: Any = jax.device_put(own, self._host)
-        jax.block_until_ready(arrays)
-        return arrays, jax.tree.map(_seen, arrays)
+    def _shared(self, numbers: np.ndarray) -> tuple[Array, np.ndarray]:
+        """Returns numbers in that memory, and the same as an array of NumPy."""
+        own = np.array(numbers)  # a CPU may take them as they lie
+        array = jax.block_until_ready(jax.device_put(own, self._host))
+        return array, _seen(array)
+
+
+def _packed(given: Given) -> np.ndarray:
+    """Returns `[D + 2]` or `[N, D + 2]`: of every world the number, a flag and obs."""
+    lead = (*np.shape(given.is_new), 1)
+    number = np.full(lead, given.number, np.int32)
+    flag = np.reshape(given.is_new, lead).astype(np.int32)
+    obs = np.asarray(given.obs, np.float32).view(np.int32)
+    return np.concatenate([number, flag, obs], axis=-1)
+
+
+def _unpacked(words: Array) -> Given:
+    """Returns what was packed."""
+    obs = jax.lax.bitcast_convert_type(words[..., 2:], jnp.float32)
+    return Given(words[..., 0].reshape(-1)[0], words[..., 1] != 0, obs)
 
 
 def _seen(array: Array) -> np.ndarray:

@@ -135,7 +135,7 @@ def test_no_action_of_a_gpu_is_seen_before_it_is_known(num_envs):
     with jax.default_device(DEVICE):
         params = jaxpets.PlanParams(jax.jit(model.init)(KEY), jnp.ones(2))
         calls = [compiled(act, place) for place in (places(), None)]
-        states = [first_state(planner, lead, places())] * 2
+        states = [first_state(planner, lead, places()) for _ in calls]
         rng = np.random.default_rng(0)
         for number in range(300):
             is_new = np.full(lead, number % 100 == 0)
