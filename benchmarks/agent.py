@@ -3,9 +3,11 @@
 The plan alone is one compiled call whose action comes to the host, through `memory`: on
 a GPU the program writes it to the host's pinned memory. `act` checks the observation
 besides, and keeps what it did for `observe`; on a GPU it does not wait for XLA to say
-that an action has come. `added_ms` is the median of the differences, pair by pair.
-`copied_ms` is that of the plan alone whose action is copied from the device, which is
-how rows without `memory` have `plan_ms`.
+that an action has come. Both give the memory of the planner's state away for the next
+one. `added_ms` is the median of the differences, pair by pair. `copied_ms` is that of
+the plan alone whose action is copied from the device, which is how rows without
+`memory` have `plan_ms`. With `--means` no noise is drawn, as by `--task-planner.means`
+of the experiments.
 
 With `--policy` it is a step of a distilled policy instead, which needs no plan: by
 onnxruntime on one thread, and by JAX, one after the other.
@@ -24,7 +26,7 @@ from jax.sharding import SingleDeviceSharding
 
 import jaxpets
 from benchmarks import rows, timing, workloads
-from jaxpets import policies
+from jaxpets import models, policies
 from jaxpets.envs import half_cheetah
 
 COLUMNS = ("added_ms", "act_ms", "act_p99_ms", "plan_ms", "plan_p99_ms", "copied_ms",
@@ -38,9 +40,11 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row."""
     size = workloads.chosen_size(args)
     planner = workloads.planner(
-        size, args.precision, args.optimizer, engine=args.engine
+        size, args.precision, args.optimizer, args.reward, engine=args.engine
     )
-    turns = timing.in_turn(*calls(size, planner), repeats=args.repeats)
+    if args.means:
+        planner = by_means(planner)
+    turns = timing.in_turn(*calls(size, planner, args.reward), repeats=args.repeats)
     acts, plans, copied = 1e3 * np.asarray(turns).T
     yield rows.make_row(
         "agent",
@@ -50,6 +54,8 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             "precision": args.precision,
             "engine": args.engine,
             "optimizer": args.optimizer,
+            "reward": args.reward,
+            "means": args.means,
         },
         arch=workloads.arch(size, args.precision, args.engine),
         awaited=True,
@@ -75,10 +81,22 @@ def memory() -> str:
     return device.default_memory().kind
 
 
-def calls(size: workloads.Size, planner: jaxpets.Planner) -> tuple[Call, Call, Call]:
+def by_means(planner: jaxpets.Planner) -> jaxpets.Planner:
+    """Returns a planner that imagines what each member holds most likely."""
+
+    def step(params: jaxpets.PlanParams, *now: Any) -> Any:
+        quiet = models.without_noise(params.dynamics)
+        return planner.step(params._replace(dynamics=quiet), *now)
+
+    return planner._replace(step=step)
+
+
+def calls(
+    size: workloads.Size, planner: jaxpets.Planner, reward: str
+) -> tuple[Call, Call, Call]:
     """Returns `act` of an agent, its plan alone, and that with a copied action."""
     key = jax.random.key(0)
-    params = jax.jit(lambda: workloads.plan_params(size, key, "epistemic"))()
+    params = jax.jit(lambda: workloads.plan_params(size, key, reward))()
     one = np.ones(half_cheetah.ACTION_SIZE, np.float32)
     agent = jaxpets.agent(
         planner,
@@ -91,17 +109,25 @@ def calls(size: workloads.Size, planner: jaxpets.Planner) -> tuple[Call, Call, C
     agent.perform(params.reward)
     obs = np.asarray(workloads.transitions(key, 1).obs[0])
     here, copied = SingleDeviceSharding(jax.devices()[0]), jax.jit(planner.step)
-    state = jax.device_put(planner.init(), here)
+    first = planner.init()
+    state = jax.device_put(jax.tree.map(jax.numpy.copy, first), here)
 
     def act(*given: Any) -> tuple[jax.Array, Any]:
         output, state = planner.step(*given)
         return output.action, state
 
-    step = jax.jit(act, out_shardings=(here.with_memory_kind(memory()), here))
+    places = here.with_memory_kind(memory()), here
+    step = jax.jit(act, donate_argnums=2, out_shardings=places)
+
+    def loop() -> np.ndarray:
+        nonlocal state
+        action, state = step(params, key, state, obs)
+        return np.asarray(action)
+
     return (
         lambda: agent.act(obs),
-        lambda: np.asarray(step(params, key, state, obs)[0]),
-        lambda: np.asarray(copied(params, key, state, obs)[0].action),
+        loop,
+        lambda: np.asarray(copied(params, key, first, obs)[0].action),
     )
 
 
@@ -170,6 +196,8 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
         "--precision", choices=workloads.PRECISIONS, default="f32", help="of the model"
     )
     parser.set_defaults(size="laptop", repeats=1000)
+    parser.add_argument("--reward", choices=workloads.REWARDS, default="task")
+    parser.add_argument("--means", action="store_true", help="draw no noise")
     parser.add_argument("--policy", action="store_true", help="a policy, not a plan")
     args = parser.parse_args(argv)
     if args.policy:

@@ -38,7 +38,7 @@ ENGINES = ("scan", "kernel", "sm_90")
 PRECISIONS = tuple(precision.value for precision in jaxpets.Precision)
 OPTIMIZERS = ("cem", "icem")
 REWARDS = ("epistemic", "task")
-_OTHERS = ("num_particles", "num_iterations")
+_OTHERS = ("num_particles", "num_iterations", "num_elites")
 
 
 def named_size(name: str) -> Size:

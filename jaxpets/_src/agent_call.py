@@ -142,8 +142,8 @@ class Mailbox:
     def _shared(self, numbers: np.ndarray) -> tuple[Array, np.ndarray]:
         """Returns numbers in that memory, and the same as an array of NumPy."""
         own = np.array(numbers)  # a CPU may take them as they lie
-        array = jax.block_until_ready(jax.device_put(own, self._host))
-        return array, _seen(array)
+        array = jax.device_put(own, self._host)
+        return array, _seen(array.block_until_ready())
 
 
 def _packed(given: Given) -> np.ndarray:

@@ -27,6 +27,8 @@ from benchmarks import (
 )
 from benchmarks import all as all_benchmarks
 from benchmarks import rows as rows_module
+from jaxpets import models
+from jaxpets.envs import half_cheetah
 
 ENVIRONMENT = {"benchmark", "date", "device", "cpus", "git", "versions", "sizes"}
 TIMING = {"compile_s", "min_ms", "median_ms", "p99_ms", "repeats"}
@@ -183,8 +185,23 @@ def test_agent_says_through_which_memory_an_action_came(monkeypatch):
         assert agent.memory() == device.default_memory().kind
     for kind in ways:
         monkeypatch.setattr(agent, "memory", lambda kind=kind: kind)
-        _, plan_alone, copied = agent.calls(size, planner)
+        _, plan_alone, copied = agent.calls(size, planner, "epistemic")
         np.testing.assert_array_equal(plan_alone(), copied())
+
+
+def test_agent_by_means_draws_no_noise():
+    size, key = workloads.named_size("tiny"), jax.random.key(0)
+    planner = workloads.planner(size, "f32", "icem", "task")
+    params = workloads.plan_params(size, key, "task")
+    quiet = params._replace(dynamics=models.without_noise(params.dynamics))
+    state, obs = planner.init(), np.zeros(half_cheetah.OBS_SIZE, np.float32)
+
+    def action(planner, params):
+        return jax.jit(planner.step)(params, key, state, obs)[0].action
+
+    found = action(agent.by_means(planner), params)
+    np.testing.assert_array_equal(found, action(planner, quiet))
+    assert (found != action(planner, params)).any()
 
 
 def test_agent_with_a_policy(tmp_path):
@@ -323,8 +340,6 @@ def test_model_quality_of_ours_on_real_transitions(tmp_path):
 
 
 def test_preprocessing_for_mbrl_lib_is_ours():
-    from jaxpets.envs import half_cheetah
-
     key = jax.random.key(0)
     drawn = workloads.transitions(key, 7)
     arrays = {name: np.asarray(x) for name, x in drawn._asdict().items()}

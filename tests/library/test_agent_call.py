@@ -107,6 +107,24 @@ def test_a_slow_action_is_awaited():
         np.testing.assert_array_equal(action, [number, 1.0])
 
 
+def test_a_step_takes_its_states_memory_and_never_a_planners():
+    kept = jnp.ones(3)
+
+    def step(params, key, state, obs):
+        return jaxpets.typing.PlanOutput(params * state[:1], (), ()), state + 1
+
+    planner = jaxpets.Planner(lambda: kept, step)
+    for lead in ((), (1,)):  # for which alone the state would be that very array
+        act = compiled(act_fn(planner, 1, 1 if lead else None), places())
+        first = state = first_state(planner, lead, places())
+        for number in range(3):
+            told = given(number, np.zeros((*lead, 2)), np.zeros(lead, bool))
+            action, state = act(2.0, KEY, state, told)
+            np.testing.assert_array_equal(action, np.full((*lead, 1), 2.0 + 2 * number))
+        assert first.is_deleted()
+        np.testing.assert_array_equal(kept, 1.0)
+
+
 @pytest.mark.skipif(DEVICE.platform != "cpu", reason="the runtime refuses there")
 def test_what_xla_puts_elsewhere_is_found_there():
     step, places_seen, held = compiled(act, places()), [], None
