@@ -51,6 +51,23 @@ def test_a_row_without_the_plain_program_of_its_commit_is_not_compared():
     assert pair.committed == COMMITTED[1] and pair.speed == 1.0
 
 
+def test_c_mujoco_is_measured_by_the_plain_loop_of_its_host():
+    """Which is timed after it."""
+
+    def day(gpu, host):
+        return [plain(gpu), row(4.0 * host, "env", engine="mujoco", batch=1),
+                row(gpu, "env", engine="mjx", batch=1),
+                row(host, "env", engine="mujoco-loop", batch=1)]  # fmt: skip
+
+    today, slower = day(10.0, 2.0), day(10.0, 2.0)
+    slower[1]["min_ms"] *= 2
+    for found, speed in ((today, 1.0), (slower, 0.5)):
+        speeds = [pair.speed for pair in against.pairs(found, day(20.0, 1.0))]
+        assert speeds == [1.0, pytest.approx(speed), 1.0, 1.0]
+    alone = today[:2]
+    assert [x.speed for x in against.pairs(alone, day(10.0, 1.0))] == [1.0, None]
+
+
 def test_what_became_slower_is_returned_and_all_is_printed(tmp_path, capsys):
     lines = [*COMMITTED, {"benchmark": "accuracy", "device": "card", "sizes": {}}]
     rival = {"name": "rival", "device": "card", "engine": "jit", "dtype": "f32",
