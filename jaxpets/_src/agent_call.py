@@ -119,19 +119,21 @@ class Mailbox:
         boxes, self._boxes = self._boxes, None
         if boxes is None:
             action, _ = jax.eval_shape(self._act, params, key, state, given)
-            zeros = np.zeros(action.shape, action.dtype)
-            boxes = self._shared(zeros), self._shared(_packed(given))
+            *lead, size = np.shape(given.obs)
+            zeros: Any = np.zeros(action.shape, action.dtype)
+            words = np.zeros((*lead, size + 2), np.int32)
+            boxes = self._shared(zeros), self._shared(words)
         (slot, action), (inputs, view) = boxes
         slot.block_until_ready()  # the call before has ended, and reads no more
-        view[...] = _packed(given)
-        words = action.reshape(-1).view(np.uint32)
-        words[:] = _UNSEEN
+        _pack(view, given)
+        awaited = action.reshape(-1).view(np.uint32)
+        awaited[:] = _UNSEEN
         slot, state = self.program(slot, state, params, key, inputs)
         if slot.unsafe_buffer_pointer() != action.ctypes.data:
             action = _seen(slot.block_until_ready())  # XLA has put it elsewhere
-            words = words[:0]
+            awaited = awaited[:0]
         has_ended = False
-        while (words == _UNSEEN).any():
+        while (awaited == _UNSEEN).any():
             if has_ended:
                 return np.array(slot), state  # which raises what has failed
             has_ended = slot.is_ready()
@@ -146,17 +148,15 @@ class Mailbox:
         return array, _seen(array.block_until_ready())
 
 
-def _packed(given: Given) -> np.ndarray:
-    """Returns `[D + 2]` or `[N, D + 2]`: of every world the number, a flag and obs."""
-    lead = (*np.shape(given.is_new), 1)
-    number = np.full(lead, given.number, np.int32)
-    flag = np.reshape(given.is_new, lead).astype(np.int32)
-    obs = np.asarray(given.obs, np.float32).view(np.int32)
-    return np.concatenate([number, flag, obs], axis=-1)
+def _pack(words: np.ndarray, given: Given) -> None:
+    """Writes into `[D + 2]` or `[N, D + 2]`: of every world the number, a flag, obs."""
+    words[..., 0] = given.number
+    words[..., 1] = given.is_new
+    words[..., 2:].view(np.float32)[...] = given.obs
 
 
 def _unpacked(words: Array) -> Given:
-    """Returns what was packed."""
+    """Returns what was packed, on the device."""
     obs = jax.lax.bitcast_convert_type(words[..., 2:], jnp.float32)
     return Given(words[..., 0].reshape(-1)[0], words[..., 1] != 0, obs)
 
