@@ -10,7 +10,7 @@ waited for wakes late on some days.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,6 @@ from benchmarks import workloads
 
 RESULTS = Path(__file__).parent / "results"
 SLOWER = 0.9  # of the committed speed: no longer chance
-_LOOP = "mujoco-loop"
 _PLAN = {
     "num_samples": workloads.named_size("paper").num_samples,
     "engine": "scan",
@@ -88,22 +87,34 @@ def report(today: Sequence[Row], committed: Sequence[Row]) -> list[Row]:
 def _with_unit(rows: Iterable[Row]) -> Iterator[tuple[Row, float | None]]:
     """Yields each row that has a time, with its plain program's if it is known."""
     timed = [row for row in rows if "min_ms" in row]
-    units = {_unit(row): row["min_ms"] for row in reversed(timed) if _is_loop(row)}
-    for row in timed:
-        is_plan = row["benchmark"] == "plan" and _PLAN.items() <= row["sizes"].items()
-        if is_plan or _is_loop(row):
-            units[_unit(row)] = row["min_ms"]
-        yield row, units.get(_unit(row))
+    loops = [*_seen_last(reversed(timed), _is_loop)][::-1]
+    plans = _seen_last(timed, _is_plan)
+    for row, plan, loop in zip(timed, plans, loops, strict=True):
+        yield row, loop if _engine(row).startswith("mujoco") else plan
 
 
-def _unit(row: Row) -> tuple[str, str | None, bool]:
-    """Returns what tells plain programs apart: device, commit, whether it is in C."""
-    is_in_c = row["sizes"].get("engine", "").startswith("mujoco")
-    return row["device"], row.get("git"), is_in_c
+def _seen_last(
+    rows: Iterable[Row], is_plain: Callable[[Row], bool]
+) -> Iterator[float | None]:
+    """Yields for each row the last plain program's time, of its device and commit."""
+    last: dict[tuple[str, str | None], float] = {}
+    for row in rows:
+        where = row["device"], row.get("git")
+        if is_plain(row):
+            last[where] = row["min_ms"]
+        yield last.get(where)
+
+
+def _is_plan(row: Row) -> bool:
+    return row["benchmark"] == "plan" and _PLAN.items() <= row["sizes"].items()
 
 
 def _is_loop(row: Row) -> bool:
-    return row["sizes"].get("engine") == _LOOP
+    return _engine(row) == "mujoco-loop"
+
+
+def _engine(row: Row) -> str:
+    return row["sizes"].get("engine", "")
 
 
 def _key(row: Row) -> str:

@@ -3,11 +3,12 @@
 The plan alone is one compiled call whose action comes to the host, through `memory`: on
 a GPU the program writes it to the host's pinned memory. `act` checks the observation
 besides, and keeps what it did for `observe`; on a GPU it does not wait for XLA to say
-that an action has come. Both give the memory of the planner's state away for the next
-one. `added_ms` is the median of the differences, pair by pair. `copied_ms` is that of
-the plan alone whose action is copied from the device, which is how rows without
-`memory` have `plan_ms`. With `--means` no noise is drawn, as by `--task-planner.means`
-of the experiments.
+that an action has come. The loop gives the memory of the planner's state away for the
+next one, and so does `act` on a GPU. `added_ms` is the median of the differences, pair
+by pair. `copied_ms` is that of the plan alone whose action is copied from the device,
+which is how rows without `memory` have `plan_ms`. Rows without `reward` explored, and
+kept the state. With `--means` no noise is drawn, as by `--task-planner.means` of the
+experiments.
 
 With `--policy` it is a step of a distilled policy instead, which needs no plan: by
 onnxruntime on one thread, and by JAX, one after the other.

@@ -2,7 +2,7 @@
 
 Then prints all rows beside those that are committed for the same kind of device, and
 the plans of other systems. Its exit code is 1 if anything is slower than nine tenths
-of its committed speed, both as multiples of the plain XLA program's, or if a program
+of its committed speed, both in units of a plain program (`against`), or if a program
 cannot run of which this kind of GPU has rows.
 """
 

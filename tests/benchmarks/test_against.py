@@ -64,6 +64,9 @@ def test_c_mujoco_is_measured_by_the_plain_loop_of_its_host():
     for found, speed in ((today, 1.0), (slower, 0.5)):
         speeds = [pair.speed for pair in against.pairs(found, day(20.0, 1.0))]
         assert speeds == [1.0, pytest.approx(speed), 1.0, 1.0]
+    # Two hosts of one commit: a step on the second takes as much of its own loop.
+    twice = list(against.pairs([*day(10.0, 2.0), *day(10.0, 1.0)], day(10.0, 1.0)))
+    assert [pair.speed for pair in twice] == [pytest.approx(1.0)] * 8
     alone = today[:2]
     assert [x.speed for x in against.pairs(alone, day(10.0, 1.0))] == [1.0, None]
 

@@ -243,7 +243,11 @@ def test_another_planner_performs(make, trained):
     assert 3 <= agent.act(at(0.0)) <= 4
 
 
-def test_after_a_plan_that_failed_it_plans_anew(make, trained):
+@pytest.mark.parametrize("apart", [(), ("cpu", "gpu")], ids=["own", "shared memory"])
+def test_after_a_plan_that_failed_it_plans_anew(make, trained, apart, monkeypatch):
+    """Also where the step that failed had been given its state's memory."""
+    monkeypatch.setattr(agent_call, "_APART", apart)
+
     def checked(obs):
         if obs[0] > 1:
             raise ValueError("too far")
@@ -256,6 +260,7 @@ def test_after_a_plan_that_failed_it_plans_anew(make, trained):
         return output._replace(action=output.action + there), state + there[0]
 
     agent = make(params=trained)
+    assert bool(agent._places) == bool(apart)
     agent.perform(0.0, jaxpets.Planner(zero, step))
     first = agent.act(at(0.5))
     with pytest.raises(Exception, match="too far"):
