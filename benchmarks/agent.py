@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         size, args.precision, args.optimizer, args.reward, engine=args.engine
     )
     if args.means:
-        planner = by_means(planner)
+        planner = models.by_means(planner)
     turns = timing.in_turn(*calls(size, planner, args.reward), repeats=args.repeats)
     acts, plans, copied = 1e3 * np.asarray(turns).T
     yield rows.make_row(
@@ -80,16 +80,6 @@ def memory() -> str:
     if device.platform == "gpu" and is_alone and "pinned_host" in kinds:
         return "pinned_host"
     return device.default_memory().kind
-
-
-def by_means(planner: jaxpets.Planner) -> jaxpets.Planner:
-    """Returns a planner that imagines what each member holds most likely."""
-
-    def step(params: jaxpets.PlanParams, *now: Any) -> Any:
-        quiet = models.without_noise(params.dynamics)
-        return planner.step(params._replace(dynamics=quiet), *now)
-
-    return planner._replace(step=step)
 
 
 def calls(

@@ -12,7 +12,7 @@ from jax import Array
 
 import jaxpets
 from jaxpets.envs import Robot
-from jaxpets.models import without_noise
+from jaxpets.models import by_means
 from jaxpets.policies import ActorCritic, prior
 
 from . import robots
@@ -77,7 +77,7 @@ def build(config: Config) -> Parts:
         planner = jaxpets.plan(
             rollout, reward_fn, search_fn, terminal_fn=terminal_fn, **behind
         )
-        return _without_noise(planner) if search.means else planner, kind
+        return by_means(planner) if search.means else planner, kind
 
     reward = robot.tasks.reward_fn
     if config.pessimism:
@@ -207,14 +207,6 @@ def ensemble_config(model: ModelConfig) -> jaxpets.EnsembleConfig:
         state_margin=model.state_margin,
         activation=model.activation,
     )
-
-
-def _without_noise(planner: jaxpets.Planner) -> jaxpets.Planner:
-    def step(params: jaxpets.PlanParams, *now: Any) -> Any:
-        quiet = without_noise(params.dynamics)
-        return planner.step(params._replace(dynamics=quiet), *now)
-
-    return planner._replace(step=step)
 
 
 def _fitter(

@@ -72,6 +72,7 @@ LAYERS = {
     "_src.ensemble_config": 2,
     "_src.ensemble_params": 3,
     "_src.ensemble": 4,
+    "_src.by_means": 4,
     "_src.optimizer": 1,
     "_src.fit_records": 4,
     "_src.fitter": 5,

@@ -120,9 +120,10 @@ class Mailbox:
         if boxes is None:
             action, _ = jax.eval_shape(self._act, params, key, state, given)
             *lead, size = np.shape(given.obs)
-            zeros: Any = np.zeros(action.shape, action.dtype)
-            words = np.zeros((*lead, size + 2), np.int32)
-            boxes = self._shared(zeros), self._shared(words)
+            boxes = (
+                self._shared(action.shape, action.dtype),
+                self._shared((*lead, size + 2), np.int32),
+            )
         (slot, action), (inputs, view) = boxes
         slot.block_until_ready()  # the call before has ended, and reads no more
         _pack(view, given)
@@ -141,10 +142,9 @@ class Mailbox:
         self._boxes = (slot, action), (inputs, view)
         return action.copy(), state
 
-    def _shared(self, numbers: np.ndarray) -> tuple[Array, np.ndarray]:
-        """Returns numbers in that memory, and the same as an array of NumPy."""
-        own = np.array(numbers)  # a CPU may take them as they lie
-        array = jax.device_put(own, self._host)
+    def _shared(self, shape: tuple[int, ...], dtype: Any) -> tuple[Array, np.ndarray]:
+        """Returns zeros in that memory, and the same as an array of NumPy."""
+        array = jax.device_put(np.zeros(shape, dtype), self._host)
         return array, _seen(array.block_until_ready())
 
 

@@ -27,7 +27,6 @@ from benchmarks import (
 )
 from benchmarks import all as all_benchmarks
 from benchmarks import rows as rows_module
-from jaxpets import models
 from jaxpets.envs import half_cheetah
 
 ENVIRONMENT = {"benchmark", "date", "device", "cpus", "git", "versions", "sizes"}
@@ -187,21 +186,6 @@ def test_agent_says_through_which_memory_an_action_came(monkeypatch):
         monkeypatch.setattr(agent, "memory", lambda kind=kind: kind)
         _, plan_alone, copied = agent.calls(size, planner, "epistemic")
         np.testing.assert_array_equal(plan_alone(), copied())
-
-
-def test_agent_by_means_draws_no_noise():
-    size, key = workloads.named_size("tiny"), jax.random.key(0)
-    planner = workloads.planner(size, "f32", "icem", "task")
-    params = workloads.plan_params(size, key, "task")
-    quiet = params._replace(dynamics=models.without_noise(params.dynamics))
-    state, obs = planner.init(), np.zeros(half_cheetah.OBS_SIZE, np.float32)
-
-    def action(planner, params):
-        return jax.jit(planner.step)(params, key, state, obs)[0].action
-
-    found = action(agent.by_means(planner), params)
-    np.testing.assert_array_equal(found, action(planner, quiet))
-    assert (found != action(planner, params)).any()
 
 
 def test_agent_with_a_policy(tmp_path):

@@ -14,7 +14,7 @@ from jaxpets import EnsembleParams, FitConfig, PlanParams, rewards
 from jaxpets.datasets import append, grow, init, obs_variance
 from jaxpets.envs import env_rollout, from_brax
 from jaxpets.envs import half_cheetah as hc
-from jaxpets.models import without_noise
+from jaxpets.models import by_means, without_noise
 from jaxpets.optimizers import sharded
 from jaxpets.policies import guided_reward
 
@@ -192,6 +192,8 @@ WRONG = {
         lambda: FITTER.step(PARAMS, KEY, FIT, None), "dataset must be a Dataset"),
     "guided_reward of no function": (
         lambda: guided_reward(3), "reward_fn must be a function, got 3"),
+    "by_means of no planner": (
+        lambda: by_means(None), "planner must be a Planner"),
     "without_noise of no model": (
         lambda: without_noise(None), "params must be an EnsembleParams"),
     "without_noise of a model of another kind": (

@@ -10,7 +10,7 @@ import toys
 import jaxpets
 from jaxpets import EnsembleConfig, Precision
 from jaxpets._src.ensemble_config import layer_decays
-from jaxpets.models import without_noise
+from jaxpets.models import by_means, without_noise
 
 E, B, D, A = 3, 7, 2, 1
 
@@ -221,6 +221,23 @@ def test_without_noise_a_model_imagines_the_means_of_its_members(params):
     quiet_mean, quiet_variance = jax.jit(model.predict)(quiet, obs, action)
     np.testing.assert_array_equal(quiet_mean, mean)
     assert 0 <= quiet_variance.min() <= quiet_variance.max() < 1e-30
+
+
+def test_a_planner_by_means_draws_no_noise(params):
+    rollout = jaxpets.particle_rollout(
+        toys.small_ensemble().sample, num_members=3, num_particles=3
+    )
+    planner = jaxpets.plan(rollout, toys.reach, toys.optimizer("icem"))
+    given = jaxpets.PlanParams(params, 0.5)
+    quiet = given._replace(dynamics=without_noise(params))
+
+    def action(planner, given):
+        step = jax.jit(planner.step)
+        return step(given, jax.random.key(0), planner.init(), jnp.zeros(2))[0].action
+
+    found = action(by_means(planner), given)
+    np.testing.assert_array_equal(found, action(planner, quiet))
+    assert (found != action(planner, given)).any()
 
 
 @pytest.mark.parametrize("precision", [Precision.TF32, Precision.BF16])
