@@ -1,10 +1,10 @@
 """C MuJoCo inside JAX programs: physics on the cores of the host, by a callback."""
 
+import operator
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from typing import Any, cast
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,22 +16,13 @@ from jaxpets.envs.host_call import host_call
 
 with needs_extra():
     import mujoco
+    from mujoco.batch import Batch
 
-_BITS = cast(Any, mujoco).mjtState  # made at import, where pyright does not see it
-# One row: the clock, then the inputs in the order in which MuJoCo packs them.
-_INPUTS = int(
-    _BITS.mjSTATE_TIME
-    | _BITS.mjSTATE_QPOS
-    | _BITS.mjSTATE_QVEL
-    | _BITS.mjSTATE_ACT
-    | _BITS.mjSTATE_WARMSTART
-    | _BITS.mjSTATE_CTRL
-)
+_C: Any = mujoco  # its names are made at import, where pyright does not see them
+_BITS = _C.mjtState
 # `(qpos, qvel, qacc_warmstart, act, ctrl) -> (qpos, qvel, qacc_warmstart, act)`.
 PhysicsFn = Callable[[Array, Array, Array, Any, Array], tuple[Array, Array, Array, Any]]
 
-# To wake a thread takes about as long as two environment steps of HalfCheetah.
-_MIN_ROWS_PER_THREAD = 4
 # Where the clock of every step starts; MuJoCo sets it to 0 when it resets a state, in
 # any substep, and then goes on.
 _START_TIME = 1.0
@@ -42,13 +33,11 @@ def native_physics(
 ) -> PhysicsFn:
     """Builds a step of physics that runs in C, in double precision.
 
-    Under any nest of `jax.vmap` the host is called once for the whole batch and spreads
-    it over its threads; the result does not depend on how many there are. Threads and
-    buffers are made at the first call that needs them, and go with the function.
-    Several devices call in turn, each for its share under `jax.shard_map`; under `jit`
-    alone each steps the whole batch.
-
-    `mujoco.rollout` is not used: it does not return where its solver would start next.
+    Under any nest of `jax.vmap` the host is called once for the whole batch, and
+    `mujoco.batch` spreads it over threads of C; the result does not depend on how many
+    there are. They are made at the first call that needs them, and go with the
+    function. Several devices call in turn, each for its share under `jax.shard_map`;
+    under `jit` alone each steps the whole batch.
 
     Args:
       model: a compiled MuJoCo model.
@@ -67,15 +56,12 @@ def native_physics(
     """
     check_count("num_substeps", num_substeps)
     check_state(model)
-    c: Any = mujoco
     ends = np.cumsum([model.nq, model.nv, model.na, model.nv]).tolist()
     size = ends[-1]
 
-    def visit(row: np.ndarray, data: Any) -> None:
-        # In place. Python holds its lock for 1 us of the 30 that a row takes.
-        c.mj_setState(model, data, row, _INPUTS)
-        c.mj_step(model, data, num_substeps)
-        c.mj_getState(model, data, row, _INPUTS)
+    def visit(batch: Any, ids: np.ndarray | None) -> np.ndarray:
+        batch.step(ids, num_substeps)
+        return batch.state[:, 1 : 1 + size]
 
     run = _host_function(
         model, visit, size, num_threads, num_substeps * model.opt.timestep
@@ -100,9 +86,8 @@ def check_state(model: Any) -> None:
 
     As from what a control was some time ago, where an actuator has a delay.
     """
-    c: Any = mujoco
     known = 1 + model.nq + model.nv + model.na
-    if c.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != known:
+    if _C.mj_stateSize(model, _BITS.mjSTATE_FULLPHYSICS) != known:
         raise ValueError(
             "model must have no state but positions, velocities and activations."
         )
@@ -133,23 +118,26 @@ def native_readings(
       `(qpos [Q], qvel [V], qacc_warmstart [V], act [M] or (), ctrl [U]) -> [R]`,
       float32; NaN where an input is not finite.
     """
-    c: Any = mujoco
-    num_inputs = c.mj_stateSize(model, _INPUTS)
     size = len(places)
     # Neighbours of one array are copied at once.
     arrays: dict[str, tuple[list[int], list[int]]] = {}
     for i, (source, place) in enumerate(places):
         outs, ins = arrays.setdefault(source, ([], []))
-        outs.append(1 + i)
+        outs.append(i)
         ins.append(place)
+    read_fns: dict[str, Callable[[Batch], np.ndarray]]
+    read_fns = {source: operator.methodcaller("bind", source) for source in arrays}
+    if "subtree_linvel" in arrays:  # which MuJoCo computes for sensors alone
+        read_fns["subtree_linvel"] = _subtree_velocity(model)
 
-    def visit(row: np.ndarray, data: Any) -> None:
-        c.mj_setState(model, data, row[:num_inputs], _INPUTS)
-        c.mj_forward(model, data)
-        if "subtree_linvel" in arrays:
-            c.mj_subtreeVel(model, data)
+    def visit(batch: Any, ids: np.ndarray | None) -> np.ndarray:
+        for read_fn in read_fns.values():
+            read_fn(batch)  # what it binds is copied out by the next call
+        batch.forward(ids)
+        rows = np.empty((batch.nsim, size))
         for source, (outs, ins) in arrays.items():
-            row[outs] = np.ravel(getattr(data, source))[ins]
+            rows[:, outs] = read_fns[source](batch).reshape(batch.nsim, -1)[:, ins]
+        return rows
 
     run = _host_function(model, visit, size, num_threads)
 
@@ -161,9 +149,25 @@ def native_readings(
     return read
 
 
+def _subtree_velocity(model: Any) -> Callable[[Batch], np.ndarray]:
+    """Returns what `mj_subtreeVel` computes of a batch: `[simulations, bodies, 3]`."""
+    inside = np.eye(model.nbody)  # whether a body is in a subtree
+    for body in range(model.nbody - 1, 0, -1):
+        inside[model.body_parentid[body]] += inside[body]
+    masses = inside * model.body_mass
+    shares = masses / np.maximum(masses.sum(-1, keepdims=True), _C.mjMINVAL)
+
+    def velocity(batch: Batch) -> np.ndarray:
+        turning, linear = np.split(batch.bind("cvel"), 2, axis=-1)
+        centres = batch.bind("subtree_com")[:, model.body_rootid]
+        return shares @ (linear + np.cross(turning, batch.bind("xipos") - centres))
+
+    return velocity
+
+
 def _host_function(
     model: Any,
-    visit: Callable[[np.ndarray, Any], None],
+    visit: Callable[[Any, np.ndarray | None], np.ndarray],
     size: int,
     num_threads: int | None,
     duration: float = 0.0,
@@ -172,50 +176,33 @@ def _host_function(
 
     Args:
       model: a compiled MuJoCo model.
-      visit: gets a row, in which the results replace the inputs behind the clock, and
-        scratch of its own thread.
-      size: how many numbers are left in a row.
+      visit: gets simulations, in whose states the inputs are, and which of them are
+        wanted, None for all; returns `[simulations, size]`.
+      size: how many numbers are returned for a row.
       num_threads: at most this many; by default the cores this process may use.
       duration: by how much a visit moves the clock, in s.
     """
     if num_threads is None:
         num_threads = _num_cores()
     check_count("num_threads", num_threads)
-    c: Any = mujoco
     lock = threading.Lock()
-    pool = ThreadPoolExecutor(max(1, num_threads - 1), "jaxpets-native")
-    buffers: list[Any] = []  # scratch of one thread each
-
-    def visit_rows(rows: np.ndarray, data: Any) -> None:
-        for row in rows:
-            visit(row, data)
-
-    def visit_batch(rows: np.ndarray) -> None:
-        count = min(num_threads, max(1, len(rows) // _MIN_ROWS_PER_THREAD))
-        with lock:
-            while len(buffers) < count:
-                buffers.append(c.MjData(model))
-            # Every count-th row, as neighbours may all be lying and take longer.
-            others = [
-                pool.submit(visit_rows, rows[i::count], buffers[i])
-                for i in range(1, count)
-            ]
-            try:
-                visit_rows(rows[::count], buffers[0])
-            finally:
-                wait(others)  # none has scratch of the next call
-            for other in others:
-                other.result()
+    batches = [_batch(model, 1, 1)]  # one, as large as the largest call
 
     def host(inputs: np.ndarray) -> np.ndarray:
         flat = inputs.reshape(-1, inputs.shape[-1])
-        width = 1 + max(flat.shape[1], size)
-        rows = np.full((len(flat), width), _START_TIME, np.float64)
-        rows[:, 1 : 1 + flat.shape[1]] = flat
-        visit_batch(rows)
-        # A clock that was set back shows at most the duration.
-        rows[rows[:, 0] < duration + 0.5 * _START_TIME] = np.nan
-        outputs = rows[:, 1 : 1 + size].astype(np.float32)
+        count = len(flat)
+        with lock:
+            if batches[0].nsim < count:
+                batches[0] = _batch(model, count, min(num_threads, count))
+            batch: Any = batches[0]
+            # A row begins with the clock, and goes on as `_packed` has it.
+            state = batch.state[:count]
+            state[:, 0] = _START_TIME
+            state[:, 1 : 1 + flat.shape[1]] = flat
+            ids = None if count == batch.nsim else np.arange(count)
+            outputs = visit(batch, ids)[:count].astype(np.float32)
+            # A clock that was set back shows at most the duration.
+            outputs[state[:, 0] < duration + 0.5 * _START_TIME] = np.nan
         return outputs.reshape(*inputs.shape[:-1], size)
 
     call = host_call(host, size)
@@ -229,6 +216,13 @@ def _host_function(
         return jnp.where(finite, outputs, jnp.nan)
 
     return run
+
+
+def _batch(model: Any, count: int, num_threads: int) -> Batch:
+    try:
+        return Batch(model, count, num_threads)
+    except ValueError as error:
+        raise ValueError(f"model must run in batches: {error}.") from error
 
 
 def _num_cores() -> int:

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -268,22 +267,24 @@ def test_callers_in_threads_take_turns(env, states, actions, after):
         assert_same(got, after)
 
 
-def test_no_thread_works_on_after_an_error(model):
-    """What it works in is another's as soon as the next call begins."""
-    running = []
+def test_an_error_of_mujoco_is_told_and_the_next_call_is_right(
+    env, states, actions, after
+):
+    step = jax.jit(jax.vmap(env.step))
+    mujoco.set_mjcb_control(lambda model, data: None)  # its threads take none of Python
+    try:
+        with pytest.raises(jax.errors.JaxRuntimeError, match="mjcb_control"):
+            jax.block_until_ready(step(states, actions))
+    finally:
+        mujoco.set_mjcb_control(None)
+    assert_same(step(states, actions).physics, after.physics)
 
-    def visit(row, data):
-        if row[1] == 1:
-            raise ValueError("no way")
-        running.append(1)
-        time.sleep(0.02)
-        running.pop()
 
-    call = native._host_function(model, visit, 1, 3)
-    rows = jnp.zeros((48, 1)).at[0].set(1)
-    with pytest.raises(jax.errors.JaxRuntimeError, match="no way"):
-        jax.block_until_ready(jax.vmap(call)(rows))
-    assert not running
+def test_calls_of_any_size_follow_each_other(env, states, actions, after):
+    step = jax.jit(jax.vmap(env.step))
+    for count in (3, 1, 8, 2, 8):
+        got = step(*first(count, (states, actions)))
+        assert_same(got.physics, first(count, after.physics))
 
 
 def test_all_cores_are_the_default(monkeypatch):
@@ -294,20 +295,28 @@ def test_all_cores_are_the_default(monkeypatch):
 
 
 DEVICES = """
-import gc, threading
+import gc, weakref
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
-from jaxpets.envs import half_cheetah
+from jaxpets.envs import half_cheetah, native
+
+class Batch(native.Batch):
+    def __init__(self, *args):
+        super().__init__(*args)
+        made.append(weakref.ref(self))
+
+made = []
+native.Batch = Batch
 
 def roll(state, actions):
     step = lambda state, action: (jax.vmap(env.step)(state, action), None)
     return jax.lax.scan(step, state, actions)[0]
 
-def names():
-    return [t.name for t in threading.enumerate() if t.name.startswith("jaxpets")]
+def threads():
+    return sorted(batch().nthread for batch in made if batch())
 
 env = half_cheetah.half_cheetah_native(num_threads=3)
-assert not names()
+assert threads() == [1, 1]  # of physics and of what is read
 keys = jax.random.split(jax.random.key(0), 32)
 state = jax.jit(jax.vmap(env.reset))(keys)
 actions = jax.random.uniform(jax.random.key(1), (20, 32, 6), jnp.float32, -1, 1)
@@ -321,14 +330,11 @@ parts = jax.jit(jax.shard_map(roll, mesh=mesh, in_specs=specs, out_specs=specs[0
 for got in (whole, parts):
     jax.tree.map(np.testing.assert_array_equal, got.physics, want.physics)
     assert len(got.obs.sharding.device_set) == 2
-assert names()
+assert threads() == [1, 3]
 del env
 jax.clear_caches()
 gc.collect()
-for thread in threading.enumerate():
-    if thread.name.startswith("jaxpets"):
-        thread.join(10)
-assert not names()
+assert not threads()
 env = half_cheetah.half_cheetah_native(num_threads=3)
 jax.vmap(env.step)(state, actions[0])  # the program ends with its threads alive
 """
@@ -384,6 +390,11 @@ def test_a_model_with_more_state_is_refused():
     )
     with pytest.raises(ValueError, match="no state but positions, velocities and act"):
         native.native_physics(late, num_substeps=1)
+    asleep = mujoco.MjModel.from_xml_string(
+        '<mujoco><option><flag sleep="enable"/></option></mujoco>'
+    )
+    with pytest.raises(ValueError, match="model must run in batches: sleep and IPC"):
+        native.native_physics(asleep, num_substeps=1)
 
 
 @pytest.mark.parametrize(("engine", "calls"), [("mjx", 0), ("mujoco", 1)])
