@@ -1,6 +1,7 @@
 """The loop of PETS over trials: act, learn, record; resumed where it stopped."""
 
 import time
+from functools import partial
 from typing import Any, ClassVar, Protocol
 
 import jax
@@ -11,6 +12,7 @@ import jaxpets
 
 from . import acting, cost, records
 from .acting import Scorer, Tick, Trials
+from .behind import behind
 from .build import Learn, State
 from .parallel import devices
 from .parallel.devices import Placement
@@ -62,6 +64,8 @@ def run(
 ) -> bool:  # fmt: skip
     """Runs what is left of the trials `first + 1` to `last`; saves after each.
 
+    A trial is saved while the next one acts.
+
     Args:
       folder: of the run.
       phase: what to do.
@@ -94,7 +98,17 @@ def run(
             progress.compiling(cost.compiling(program))
         compiled.add(program)
 
-    with progress.interruptible():
+    def save(trial: int, rows: list[dict[str, Any]], learned: Any, line: str) -> None:
+        folder.record(trial, rows, learned, finite=(learned.params, learned.fit))
+        progress.line(line)
+        rate, left = progress.pace()
+        folder.update(
+            trial=trial, num_trials=last, line=line,
+            steps_per_second=rate, seconds_left=left,
+            device_bytes=devices.bytes_in_use(),
+        )  # fmt: skip
+
+    with progress.interruptible(), behind() as saving:
         for trial in range(done + 1, last + 1):
             act_keys, learn_keys = acting.split_keys(phase.keys(trial))
             labels = phase.labels(trial)
@@ -104,6 +118,7 @@ def run(
             trials = collect(acts)
             acted = time.monotonic()
             calls("fit")
+            saving.wait()  # learning gives away what is saved
             state, fit = phase.learn(place(learn_keys), state, acts.transitions)
             jax.block_until_ready(state)
             progress.did("fit", trial)
@@ -113,16 +128,9 @@ def run(
             if trial == 1:
                 records.check_begun(rows, steps)
             timed = [{**row, "seconds": seconds} for row in rows]
-            folder.record(trial, timed, learned, finite=(learned.params, learned.fit))
             text = f"{phase.name} {trial}/{last}  {records.describe(rows)}"
             text = f"{text}  {sum(seconds.values()):.1f} s"
-            progress.line(text)
-            rate, left = progress.pace()
-            folder.update(
-                trial=trial, num_trials=last, line=text,
-                steps_per_second=rate, seconds_left=left,
-                device_bytes=devices.bytes_in_use(),
-            )  # fmt: skip
+            saving.call(partial(save, trial, timed, learned, text))
     return True
 
 
