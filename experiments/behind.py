@@ -29,6 +29,11 @@ class Behind:
         if not distributed.is_alone():
             self.wait()
 
+    def check(self) -> None:
+        """Raises what the last call has raised, if it has."""
+        if self._last is not None and self._last.done():
+            self.wait()
+
     def wait(self) -> None:
         """Returns when the last call has; what that has raised is raised here."""
         last, self._last = self._last, None

@@ -108,13 +108,17 @@ def run(
             device_bytes=devices.bytes_in_use(),
         )  # fmt: skip
 
+    def tick(num_steps: int) -> None:
+        progress.tick(num_steps)
+        saving.check()  # a disk that is full is no matter for the end of a trial
+
     with progress.interruptible(), behind() as saving:
         for trial in range(done + 1, last + 1):
             act_keys, learn_keys = acting.split_keys(phase.keys(trial))
             labels = phase.labels(trial)
             calls(labels[0].get("planner", "plan"))
             begin = time.monotonic()
-            acts = phase.act(trial, state, act_keys, progress.tick)
+            acts = phase.act(trial, state, act_keys, tick)
             trials = collect(acts)
             acted = time.monotonic()
             calls("fit")
