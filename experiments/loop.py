@@ -109,8 +109,8 @@ def run(
         )  # fmt: skip
 
     def tick(num_steps: int) -> None:
+        saving.check()  # a full disk is said before another trial ends, or a stop
         progress.tick(num_steps)
-        saving.check()  # a disk that is full is no matter for the end of a trial
 
     with progress.interruptible(), behind() as saving:
         for trial in range(done + 1, last + 1):
@@ -123,10 +123,11 @@ def run(
             acted = time.monotonic()
             calls("fit")
             saving.wait()  # learning gives away what is saved
+            saved = time.monotonic()
             state, fit = phase.learn(place(learn_keys), state, acts.transitions)
             jax.block_until_ready(state)
             progress.did("fit", trial)
-            seconds = {"act": acted - begin, "fit": time.monotonic() - acted}
+            seconds = {"act": acted - begin, "fit": time.monotonic() - saved}
             learned, fit = collect((state, fit))
             rows = records.rows(phase.scorer, labels, trials, fit, learned.params)
             if trial == 1:

@@ -218,6 +218,8 @@ def _plain_warnings() -> Iterator[None]:
 
     with warnings.catch_warnings():
         warnings.showwarning = show
+        # Here and not where it writes, as that is done by another thread.
+        warnings.filterwarnings("ignore", module="orbax")
         yield
 
 

@@ -15,7 +15,6 @@ import errno
 import json
 import logging
 import os
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -280,9 +279,8 @@ def _manager(directory: Path, **options: Any) -> Iterator[ocp.CheckpointManager]
     options |= {"create": False, "multiprocessing_options": _FIRST}
     options |= {"enable_async_checkpointing": False, "lightweight_initialize": True}
     try:
-        with warnings.catch_warnings(action="ignore"):
-            chosen = ocp.CheckpointManagerOptions(**options)
-            with ocp.CheckpointManager(directory, options=chosen) as manager:
-                yield manager
+        chosen = ocp.CheckpointManagerOptions(**options)
+        with ocp.CheckpointManager(directory, options=chosen) as manager:
+            yield manager
     finally:
         logger.setLevel(level)

@@ -55,16 +55,23 @@ def native_engine(
     physics_fn = native_physics(
         model, num_substeps=num_substeps, num_threads=num_threads
     )
-    read_fn = native_readings(model, places, num_threads=num_threads)
     clip = _clip_fn(model)
 
     def advance(before: Physics, action: Array) -> Physics:
         return Physics(*physics_fn(*before, clip(action)))
 
+    if not places:
+        return Engine(advance, _nothing)
+    read_fn = native_readings(model, places, num_threads=num_threads)
+
     def read(physics: Physics, action: Array) -> Array:
         return read_fn(*physics, clip(action))
 
     return Engine(advance, read)
+
+
+def _nothing(physics: Physics, action: Array) -> Array:
+    return jnp.zeros((0,), jnp.float32)
 
 
 def _clip_fn(model: Any) -> Callable[[Array], Array]:

@@ -1,11 +1,12 @@
-"""C MuJoCo inside JAX programs: physics on the cores of the host, by a callback."""
+"""C MuJoCo inside JAX programs: physics on the cores of the host."""
 
-import operator
+import copy
 import os
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -13,6 +14,7 @@ from jax import Array
 from jaxpets._src.checks import check_count
 from jaxpets.envs.extra import needs_extra
 from jaxpets.envs.host_call import host_call
+from jaxpets.envs.native_c import c_function
 
 with needs_extra():
     import mujoco
@@ -22,6 +24,19 @@ _C: Any = mujoco  # its names are made at import, where pyright does not see the
 _BITS = _C.mjtState
 # `(qpos, qvel, qacc_warmstart, act, ctrl) -> (qpos, qvel, qacc_warmstart, act)`.
 PhysicsFn = Callable[[Array, Array, Array, Any, Array], tuple[Array, Array, Array, Any]]
+
+# What may be read: arrays of MuJoCo's data, and the number of contacts.
+READABLE = (
+    "sensordata",
+    "site_xpos",
+    "xpos",
+    "xipos",
+    "xmat",
+    "subtree_linvel",
+    "ncon",
+)
+# What MuJoCo computes for sensors alone, and what it is computed of here.
+_PARTS = {"subtree_linvel": ("cvel", "xipos", "subtree_com")}
 
 # Where the clock of every step starts; MuJoCo sets it to 0 when it resets a state, in
 # any substep, and then goes on.
@@ -56,16 +71,15 @@ def native_physics(
     """
     check_count("num_substeps", num_substeps)
     check_state(model)
+    model = copy.copy(model)  # whoever has it may change it
     ends = np.cumsum([model.nq, model.nv, model.na, model.nv]).tolist()
     size = ends[-1]
 
-    def visit(batch: Any, ids: np.ndarray | None) -> np.ndarray:
+    def visit(batch: Any, ids: np.ndarray) -> np.ndarray:
         batch.step(ids, num_substeps)
-        return batch.state[:, 1 : 1 + size]
+        return batch.state[: len(ids), 1 : 1 + size]
 
-    run = _host_function(
-        model, visit, size, num_threads, num_substeps * model.opt.timestep
-    )
+    run = _host_function(model, visit, size, num_threads, num_substeps=num_substeps)
 
     def step(
         qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
@@ -117,7 +131,18 @@ def native_readings(
     Returns:
       `(qpos [Q], qvel [V], qacc_warmstart [V], act [M] or (), ctrl [U]) -> [R]`,
       float32; NaN where an input is not finite.
+
+    Raises:
+      ValueError: if a name is of none of READABLE, or the model has more state than
+        `native_physics` takes.
     """
+    check_state(model)
+    for source, _ in places:
+        if source not in READABLE:
+            raise ValueError(
+                f"places must be of {', '.join(READABLE)}, got one of {source!r}."
+            )
+    model = copy.copy(model)
     size = len(places)
     # Neighbours of one array are copied at once.
     arrays: dict[str, tuple[list[int], list[int]]] = {}
@@ -125,21 +150,22 @@ def native_readings(
         outs, ins = arrays.setdefault(source, ([], []))
         outs.append(i)
         ins.append(place)
-    read_fns: dict[str, Callable[[Batch], np.ndarray]]
-    read_fns = {source: operator.methodcaller("bind", source) for source in arrays}
-    if "subtree_linvel" in arrays:  # which MuJoCo computes for sensors alone
-        read_fns["subtree_linvel"] = _subtree_velocity(model)
+    velocity_fn = _subtree_velocity(model)
 
-    def visit(batch: Any, ids: np.ndarray | None) -> np.ndarray:
-        for read_fn in read_fns.values():
-            read_fn(batch)  # what it binds is copied out by the next call
+    def visit(batch: Any, ids: np.ndarray) -> np.ndarray:
+        bound = {x for source in arrays for x in _PARTS.get(source, (source,))}
+        for source in bound:
+            batch.bind(source)  # so that the call copies it out
         batch.forward(ids)
-        rows = np.empty((batch.nsim, size))
+        count = len(ids)
+        rows = np.empty((count, size))
         for source, (outs, ins) in arrays.items():
-            rows[:, outs] = read_fns[source](batch).reshape(batch.nsim, -1)[:, ins]
+            parts = [batch.bind(x)[:count] for x in _PARTS.get(source, (source,))]
+            found = velocity_fn(*parts) if source in _PARTS else parts[0]
+            rows[:, outs] = found.reshape(count, -1)[:, ins]
         return rows
 
-    run = _host_function(model, visit, size, num_threads)
+    run = _host_function(model, visit, size, num_threads, places=places)
 
     def read(
         qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
@@ -149,63 +175,78 @@ def native_readings(
     return read
 
 
-def _subtree_velocity(model: Any) -> Callable[[Batch], np.ndarray]:
-    """Returns what `mj_subtreeVel` computes of a batch: `[simulations, bodies, 3]`."""
+def _subtree_velocity(model: Any) -> Callable[..., np.ndarray]:
+    """Returns what `mj_subtreeVel` computes of `_PARTS`, `[rows, bodies, 3]`."""
     inside = np.eye(model.nbody)  # whether a body is in a subtree
     for body in range(model.nbody - 1, 0, -1):
         inside[model.body_parentid[body]] += inside[body]
     masses = inside * model.body_mass
     shares = masses / np.maximum(masses.sum(-1, keepdims=True), _C.mjMINVAL)
 
-    def velocity(batch: Batch) -> np.ndarray:
-        turning, linear = np.split(batch.bind("cvel"), 2, axis=-1)
-        centres = batch.bind("subtree_com")[:, model.body_rootid]
-        return shares @ (linear + np.cross(turning, batch.bind("xipos") - centres))
+    def velocity(cvel: np.ndarray, xipos: np.ndarray, com: np.ndarray) -> np.ndarray:
+        arm = xipos - com[:, model.body_rootid]
+        return shares @ (cvel[..., 3:] + np.cross(cvel[..., :3], arm))
 
     return velocity
 
 
 def _host_function(
     model: Any,
-    visit: Callable[[Any, np.ndarray | None], np.ndarray],
+    visit: Callable[[Any, np.ndarray], np.ndarray],
     size: int,
     num_threads: int | None,
-    duration: float = 0.0,
+    *,
+    num_substeps: int = 0,
+    places: Sequence[tuple[str, int]] = (),
 ) -> Callable[..., Array]:
     """Builds a function of JAX that has C MuJoCo visit every row of a batch.
 
+    On a CPU XLA calls C where there is a compiler, and else the function of NumPy here.
+
     Args:
       model: a compiled MuJoCo model.
-      visit: gets simulations, in whose states the inputs are, and which of them are
-        wanted, None for all; returns `[simulations, size]`.
+      visit: gets a `mujoco.batch.Batch` and its first simulations `[N]`, whose states
+        the inputs are; returns `[N, size]`.
       size: how many numbers are returned for a row.
       num_threads: at most this many; by default the cores this process may use.
-      duration: by how much a visit moves the clock, in s.
+      num_substeps: by how many steps a visit moves a row.
+      places: what it reads of it, if it moves none.
     """
     if num_threads is None:
         num_threads = _num_cores()
     check_count("num_threads", num_threads)
     lock = threading.Lock()
-    batches = [_batch(model, 1, 1)]  # one, as large as the largest call
+    _batch(model, 1, 1)  # now, and not in a program, is the time to say that it cannot
+    batches: list[Any] = []  # one, as large as the largest call
+    # A clock that was set back shows at most the duration of a visit.
+    least = num_substeps * model.opt.timestep + 0.5 * _START_TIME
 
     def host(inputs: np.ndarray) -> np.ndarray:
         flat = inputs.reshape(-1, inputs.shape[-1])
         count = len(flat)
         with lock:
-            if batches[0].nsim < count:
-                batches[0] = _batch(model, count, min(num_threads, count))
-            batch: Any = batches[0]
+            if not batches or batches[0].nsim < count:
+                batches[:] = [_batch(model, count, min(num_threads, count))]
+            batch = batches[0]
             # A row begins with the clock, and goes on as `_packed` has it.
             state = batch.state[:count]
             state[:, 0] = _START_TIME
             state[:, 1 : 1 + flat.shape[1]] = flat
-            ids = None if count == batch.nsim else np.arange(count)
-            outputs = visit(batch, ids)[:count].astype(np.float32)
-            # A clock that was set back shows at most the duration.
-            outputs[state[:, 0] < duration + 0.5 * _START_TIME] = np.nan
+            outputs = visit(batch, np.arange(count)).astype(np.float32)
+            outputs[state[:, 0] < least] = np.nan
         return outputs.reshape(*inputs.shape[:-1], size)
 
-    call = host_call(host, size)
+    by_numpy = host_call(host, size)
+    by_c = c_function(
+        model, size, num_threads=num_threads, num_substeps=num_substeps,
+        clock=(_START_TIME, least), places=places,
+    )  # fmt: skip
+
+    def call(inputs: Array) -> Array:
+        if by_c is None:
+            return by_numpy(inputs)
+        choose: Any = jax.lax.platform_dependent
+        return choose(inputs, cpu=by_c, default=by_numpy)
 
     def run(*parts: Array) -> Array:
         # As one array, so that a GPU copies once each way.

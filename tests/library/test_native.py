@@ -32,9 +32,17 @@ def model():
     return hc.load_model()
 
 
-@pytest.fixture(scope="module")
-def env():
-    return hc.half_cheetah_native()
+def by_numpy(monkeypatch):
+    """Lets environments call NumPy, as where there is no compiler."""
+    monkeypatch.setattr(native, "c_function", lambda *_, **__: None)
+
+
+@pytest.fixture(scope="module", params=["c", "numpy"])
+def env(request):
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        if request.param == "numpy":
+            by_numpy(monkeypatch)
+        yield hc.half_cheetah_native()
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +172,21 @@ def test_actions_are_clipped_even_when_infinite(env, states):
 # -- transforms ----------------------------------------------------------------------
 
 
-def test_any_nest_of_vmaps_is_one_call_and_the_loop(states, actions, monkeypatch):
+def test_any_nest_of_vmaps_is_the_loop(env, states, actions):
+    state, action = first(3, states), first(4, actions)
+    over_actions = jax.vmap(env.step, (None, 0))
+    got = jax.jit(jax.vmap(over_actions, (0, None), 1))(state, action)
+    assert got.obs.shape == (4, 3, 18)
+    for i in range(3):
+        one = jax.tree.map(lambda x, i=i: x[i], state)
+        for j in range(4):
+            want = env.step(one, action[j])
+            mapped = jax.tree.map(lambda x, i=i, j=j: x[j, i], got)
+            assert_same(mapped.physics, want.physics)
+            np.testing.assert_allclose(mapped.obs, want.obs, **ROUNDING)
+
+
+def test_any_nest_of_vmaps_is_one_call(states, actions, monkeypatch):
     calls, host_call = [], native.host_call
 
     def counted(function, size):
@@ -174,22 +196,13 @@ def test_any_nest_of_vmaps_is_one_call_and_the_loop(states, actions, monkeypatch
 
         return host_call(count, size)
 
+    by_numpy(monkeypatch)
     monkeypatch.setattr(native, "host_call", counted)
     env = hc.half_cheetah_native()
-    state, action = first(3, states), first(4, actions)
     over_actions = jax.vmap(env.step, (None, 0))
-    got = jax.jit(jax.vmap(over_actions, (0, None), 1))(state, action)
-    jax.block_until_ready(got)
+    every = jax.jit(jax.vmap(over_actions, (0, None), 1))
+    jax.block_until_ready(every(first(3, states), first(4, actions)))
     assert calls == [(3, 4, 33)]
-    assert got.obs.shape == (4, 3, 18)
-    for i in range(3):
-        one = jax.tree.map(lambda x, i=i: x[i], state)
-        for j in range(4):
-            want = env.step(one, action[j])
-            mapped = jax.tree.map(lambda x, i=i, j=j: x[j, i], got)
-            assert_same(mapped.physics, want.physics)
-            np.testing.assert_allclose(mapped.obs, want.obs, **ROUNDING)
-    assert calls[1:] == [(33,)] * 12
 
 
 def test_jitted_scan_equals_the_loop(env, states, actions):
@@ -240,7 +253,7 @@ def test_plans_with_and_in_the_simulator(env, states, key):
 
 def test_gradients_are_refused(env, states):
     one = jax.tree.map(lambda x: x[0], states)
-    with pytest.raises(ValueError, match="do not support JVP"):
+    with pytest.raises(ValueError, match=r"JVP|differentiated"):
         jax.grad(lambda a: env.step(one, a).obs.sum())(jnp.zeros(6, jnp.float32))
 
 
@@ -273,7 +286,7 @@ def test_an_error_of_mujoco_is_told_and_the_next_call_is_right(
     step = jax.jit(jax.vmap(env.step))
     mujoco.set_mjcb_control(lambda model, data: None)  # its threads take none of Python
     try:
-        with pytest.raises(jax.errors.JaxRuntimeError, match="mjcb_control"):
+        with pytest.raises(jax.errors.JaxRuntimeError, match=r"mjcb_control|MuJoCo: "):
             jax.block_until_ready(step(states, actions))
     finally:
         mujoco.set_mjcb_control(None)
@@ -295,28 +308,22 @@ def test_all_cores_are_the_default(monkeypatch):
 
 
 DEVICES = """
-import gc, weakref
+import gc, os
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxpets.envs import half_cheetah, native
 
-class Batch(native.Batch):
-    def __init__(self, *args):
-        super().__init__(*args)
-        made.append(weakref.ref(self))
-
-made = []
-native.Batch = Batch
+if {by_numpy}:
+    native.c_function = lambda *_, **__: None
 
 def roll(state, actions):
     step = lambda state, action: (jax.vmap(env.step)(state, action), None)
     return jax.lax.scan(step, state, actions)[0]
 
 def threads():
-    return sorted(batch().nthread for batch in made if batch())
+    return len(os.listdir("/proc/self/task"))
 
 env = half_cheetah.half_cheetah_native(num_threads=3)
-assert threads() == [1, 1]  # of physics and of what is read
 keys = jax.random.split(jax.random.key(0), 32)
 state = jax.jit(jax.vmap(env.reset))(keys)
 actions = jax.random.uniform(jax.random.key(1), (20, 32, 6), jnp.float32, -1, 1)
@@ -330,22 +337,24 @@ parts = jax.jit(jax.shard_map(roll, mesh=mesh, in_specs=specs, out_specs=specs[0
 for got in (whole, parts):
     jax.tree.map(np.testing.assert_array_equal, got.physics, want.physics)
     assert len(got.obs.sharding.device_set) == 2
-assert threads() == [1, 3]
+before = threads()
 del env
 jax.clear_caches()
 gc.collect()
-assert not threads()
+assert threads() == before - 2
 env = half_cheetah.half_cheetah_native(num_threads=3)
 jax.vmap(env.step)(state, actions[0])  # the program ends with its threads alive
 """
 
 
-def test_devices_share_the_host_and_threads_go_with_the_environment(tmp_path):
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc knows of threads")
+@pytest.mark.parametrize("way", ["c", "numpy"])
+def test_devices_share_the_host_and_threads_go_with_the_environment(tmp_path, way):
     """In a process of its own, with two devices: sharded, freed, and gone at exit."""
     package = Path(jaxpets.__file__).parents[1]
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     result = subprocess.run(
-        [sys.executable, "-c", DEVICES],
+        [sys.executable, "-c", DEVICES.replace("{by_numpy}", str(way == "numpy"))],
         capture_output=True,
         text=True,
         timeout=120,
@@ -398,7 +407,8 @@ def test_a_model_with_more_state_is_refused():
 
 
 @pytest.mark.parametrize(("engine", "calls"), [("mjx", 0), ("mujoco", 1)])
-def test_experiments_choose_the_engine(engine, calls):
+def test_experiments_choose_the_engine(engine, calls, monkeypatch):
+    by_numpy(monkeypatch)
     config = dataclasses.replace(PRESETS["smoke"], phase="explore", engine=engine)
     env = build(config).robot.env
     state = jax.eval_shape(env.reset, jax.random.key(0))

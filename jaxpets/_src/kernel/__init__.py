@@ -8,6 +8,8 @@ tests on machines without one.
 `jaxpets.fused_fitter` has a kernel of its own, fit_*, for Hopper GPUs: an epoch of
 training. Its reference is the same source, run by fibers on a CPU.
 
+physics.cc is no kernel: C MuJoCo as XLA calls it, for `jaxpets.envs`.
+
 The code. What depends on the model is generated into model.h, all else is fixed:
 
     ModelSpace -> jaxpr -> C++               jaxpr_to_cpp.cpp_function, primitives
@@ -37,6 +39,7 @@ Who includes whom:
     gpu_particles.h     handler.h: what a warp or a block does with its particles
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
+    physics.cc          xla_call.h, and C MuJoCo
     fit_epoch.cu        fit_epoch.h, gpu_launch.h
     fit_reference.cc    fit_epoch.h
     fit_epoch.h         fit_forward.h, fit_backward.h, fit_state.h: parts of an epoch

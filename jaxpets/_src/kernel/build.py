@@ -35,6 +35,7 @@ class Kind(enum.Enum):
     CPU = "cpu_rollout.cc", "cpu"
     FIT = "fit_epoch.cu", "fit"  # training, for Hopper
     FIT_REFERENCE = "fit_reference.cc", "fit"  # the same source, on a CPU
+    PHYSICS = "physics.cc", "physics"  # C MuJoCo
 
     @property
     def source(self) -> str:
@@ -49,7 +50,8 @@ class Kind(enum.Enum):
     @property
     def symbol(self) -> str:
         """What XLA calls."""
-        return "jaxpets_fit" if self.layout == "fit" else "jaxpets_rollout"
+        known = {"fit": "jaxpets_fit", "physics": "jaxpets_physics"}
+        return known.get(self.layout, "jaxpets_rollout")
 
     @property
     def is_for_gpu(self) -> bool:
@@ -66,15 +68,20 @@ class Kernel(NamedTuple):
 
     target: str  # its name among XLA's FFI targets
     compiler: str  # name and version of what built it
+    library: Any = None  # what else it has, as functions of C
 
 
-def load_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
+def load_kernel(
+    model: str, kind: Kind, arch: str = "", needs: tuple[str, ...] = ()
+) -> Kernel:
     """Returns what `build_kernel` does, by which it is built once in this process."""
     with _ONE_AT_A_TIME:  # as XLA takes no target twice
-        return _built(model, kind, arch)
+        return _built(model, kind, arch, needs)
 
 
-def build_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
+def build_kernel(
+    model: str, kind: Kind, arch: str = "", needs: tuple[str, ...] = ()
+) -> Kernel:
     """Compiles a kernel for a model and registers it with XLA.
 
     The library is kept for the next process, see `cache`.
@@ -83,6 +90,7 @@ def build_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
       model: the text of `model.h`.
       kind: what to build.
       arch: of the GPU, as nvcc calls it: sm_90a.
+      needs: flags of the compiler for another library.
 
     Raises:
       BuildError: if it cannot be built.
@@ -91,22 +99,22 @@ def build_kernel(model: str, kind: Kind, arch: str = "") -> Kernel:
         raise BuildError("kernels are built on Linux and macOS only")
     compiler = _compiler(kind, arch)
     version = _version(compiler[0])
-    recipe = [jax.__version__, *compiler, version]
+    recipe = [jax.__version__, *compiler, *needs, version]
     if kind is Kind.CPU:
         # A folder that machines share has a library for every kind of processor.
         recipe.append(_processor(compiler))
     sources = {**_shipped_sources(), "model.h": model}
     digest = hashlib.sha256("\0".join([*recipe, *sources.values()]).encode())
     target = f"{kind.symbol}_{kind.name.lower()}_{digest.hexdigest()[:16]}"
-    make = functools.partial(_compile, compiler, sources, kind)
+    make = functools.partial(_compile, compiler, sources, kind, needs)
     try:
         with cache.library(target, make) as library:
-            handler = _loaded(library, kind)
+            loaded, handler = _loaded(library, kind)
     except OSError as error:
         raise BuildError(f"there is no folder to build it in: {error}") from error
     where = "CUDA" if kind.is_for_gpu else "cpu"
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
-    return Kernel(target, version)
+    return Kernel(target, version, loaded)
 
 
 _built = functools.cache(build_kernel)
@@ -125,20 +133,22 @@ def _shipped_sources() -> dict[str, str]:
 
 
 def _compile(
-    compiler: list[str], sources: dict[str, str], kind: Kind, folder: Path
-) -> Path:
+    compiler: list[str], sources: dict[str, str], kind: Kind, needs: tuple[str, ...],
+    folder: Path,
+) -> Path:  # fmt: skip
     """Compiles in an empty folder and returns the library's file."""
     for file, text in sources.items():
         (folder / file).write_text(text)
     library = folder / "library.so"
     include = [f"-I{folder}", f"-I{jax.ffi.include_dir()}"]
     command = [*compiler, *include, "-o", str(library), str(folder / kind.source)]
+    command += needs
     _run(command, _GPU_LIMIT if kind.is_for_gpu else _LIMIT)
     return library
 
 
-def _loaded(library: Path, kind: Kind) -> Any:
-    """Returns the kernel of a library as a function of C."""
+def _loaded(library: Path, kind: Kind) -> tuple[Any, Any]:
+    """Returns a library, and its kernel as a function of C."""
     try:
         loaded = ctypes.CDLL(str(library))
         kernel = getattr(loaded, kind.symbol)
@@ -148,7 +158,7 @@ def _loaded(library: Path, kind: Kind) -> Any:
         loaded.jaxpets_problem.restype = ctypes.c_char_p
         if problem := loaded.jaxpets_problem():
             raise BuildError(problem.decode())
-    return kernel
+    return loaded, kernel
 
 
 def _run(command: list[str], limit: float) -> str:

@@ -1,0 +1,91 @@
+"""C MuJoCo called by XLA itself, without Python: for programs that run on a CPU."""
+
+import ctypes
+import hashlib
+import weakref
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
+from jaxpets.envs.extra import needs_extra
+
+with needs_extra():
+    import mujoco
+
+_C: Any = mujoco
+
+
+def c_function(
+    model: Any,
+    size: int,
+    *,
+    num_threads: int,
+    num_substeps: int,
+    clock: tuple[float, float],
+    places: Sequence[tuple[str, int]] = (),
+) -> Callable[[Array], Array] | None:
+    """Builds a function of JAX that has C MuJoCo visit every row of a batch.
+
+    A compiled program knows it by a name, which is that of the same model and settings
+    in every process. So JAX's compilation cache keeps such programs. Threads and states
+    go with the function; a program that is still called after that makes them again.
+
+    Args:
+      model: a compiled MuJoCo model.
+      size: R, how many numbers are returned for a row.
+      num_threads: at most this many.
+      num_substeps: steps of a row; with 0 it is read.
+      clock: where it starts, and below which it was set back.
+      places: what is read, as `native_readings` takes it.
+
+    Returns:
+      `[I] -> [R]`, float32, or None if it cannot be built, as without a compiler. Under
+      any nest of `jax.vmap` it is one call. It runs on CPUs alone and has no gradient.
+    """
+    try:
+        kernel = load_kernel("", Kind.PHYSICS, needs=_flags())
+    except BuildError:
+        return None
+    settings = (num_threads, num_substeps, *clock, len(places))
+    name = hashlib.sha256(_bytes(model) + repr((settings, places)).encode()).hexdigest()
+    arrays = (ctypes.c_char_p * len(places))(*(x.encode() for x, _ in places))
+    numbers = (ctypes.c_int * len(places))(*(place for _, place in places))
+    start, least = map(ctypes.c_double, clock)
+    kernel.library.jaxpets_open(
+        name.encode(), ctypes.c_void_p(model._address), num_threads, num_substeps,
+        start, least, len(places), arrays, numbers,
+    )  # fmt: skip
+    shape = jax.ShapeDtypeStruct((size,), jnp.float32)
+    visit = jax.ffi.ffi_call(kernel.target, shape, vmap_method="broadcast_all")
+
+    def call(inputs: Array) -> Array:
+        return visit(inputs.astype(jnp.float32), name=name)
+
+    weakref.finalize(call, kernel.library.jaxpets_close, name.encode())
+    return call
+
+
+def _bytes(model: Any) -> bytes:
+    """Returns all that a compiled model is."""
+    buffer = np.empty(_C.mj_sizeModel(model), np.uint8)
+    _C.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def _flags() -> tuple[str, ...]:
+    """Returns what a compiler needs for MuJoCo, as its Python package brings it.
+
+    Raises:
+      BuildError: if it does not.
+    """
+    folder = Path(mujoco.__file__).resolve().parent
+    found = [*folder.glob("libmujoco.so.*"), *folder.glob("libmujoco.*.dylib")]
+    if not found or not (folder / "include").is_dir():
+        raise BuildError("there is no library of MuJoCo in its package")
+    return f"-I{folder / 'include'}", str(found[0]), f"-Wl,-rpath,{folder}"
