@@ -226,3 +226,9 @@ def test_a_reading_of_one_row_does_not_grow_with_a_batch(model, rows, monkeypatc
     every = jax.vmap(read)(*rows)
     np.testing.assert_array_equal(every[0], want)
     np.testing.assert_array_equal(read(*[x[0] for x in rows]), want)
+
+
+def test_a_gpu_goes_through_numpy(model, rows):
+    program = jax.jit(jax.vmap(step_of(model))).trace(*rows)
+    text = program.lower(lowering_platforms=("cuda",)).as_text()
+    assert "xla_buffer_python_gpu_callback" in text and "jaxpets_physics" not in text
