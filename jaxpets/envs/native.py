@@ -25,16 +25,6 @@ _BITS = _C.mjtState
 # `(qpos, qvel, qacc_warmstart, act, ctrl) -> (qpos, qvel, qacc_warmstart, act)`.
 PhysicsFn = Callable[[Array, Array, Array, Any, Array], tuple[Array, Array, Array, Any]]
 
-# What may be read: arrays of MuJoCo's data, and the number of contacts.
-READABLE = (
-    "sensordata",
-    "site_xpos",
-    "xpos",
-    "xipos",
-    "xmat",
-    "subtree_linvel",
-    "ncon",
-)
 # What MuJoCo computes for sensors alone, and what it is computed of here.
 _PARTS = {"subtree_linvel": ("cvel", "xipos", "subtree_com")}
 
@@ -84,7 +74,7 @@ def native_physics(
     def step(
         qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
     ) -> tuple[Array, Array, Array, Any]:
-        outputs = run(*_packed(qpos, qvel, qacc_warmstart, act, ctrl))
+        outputs = run(*_packed(model, qpos, qvel, qacc_warmstart, act, ctrl))
         return (
             outputs[: ends[0]],
             outputs[ends[0] : ends[1]],
@@ -108,11 +98,23 @@ def check_state(model: Any) -> None:
 
 
 def _packed(
-    qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
+    model: Any, qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
 ) -> list[Array]:
-    """Returns the inputs in the order in which MuJoCo packs them."""
-    activations = [act] if isinstance(act, Array) else []
-    return [qpos, qvel, *activations, qacc_warmstart, ctrl]
+    """Returns the inputs in the order in which MuJoCo packs them, each of its size."""
+    parts = {
+        "qpos": (qpos, model.nq),
+        "qvel": (qvel, model.nv),
+        "act": (act, model.na),
+        "qacc_warmstart": (qacc_warmstart, model.nv),
+        "ctrl": (ctrl, model.nu),
+    }
+    if not model.na:
+        del parts["act"]
+    for name, (part, size) in parts.items():
+        if jnp.shape(part) != (size,):
+            shape = [*jnp.shape(part)]
+            raise ValueError(f"{name} must have shape [{size}], got {shape}.")
+    return [part for part, _ in parts.values()]
 
 
 def native_readings(
@@ -133,15 +135,15 @@ def native_readings(
       float32; NaN where an input is not finite.
 
     Raises:
-      ValueError: if a name is of none of READABLE, or the model has more state than
-        `native_physics` takes.
+      ValueError: if there is no such array or place to read, or the model has more
+        state than `native_physics` takes.
     """
     check_state(model)
-    for source, _ in places:
-        if source not in READABLE:
-            raise ValueError(
-                f"places must be of {', '.join(READABLE)}, got one of {source!r}."
-            )
+    sizes = _sizes(model)
+    for source, place in places:
+        if not 0 <= place < sizes.get(source, 0):
+            known = ", ".join(f"{name} [{size}]" for name, size in sizes.items())
+            raise ValueError(f"places must be of {known}, got {source!r}, {place}.")
     model = copy.copy(model)
     size = len(places)
     # Neighbours of one array are copied at once.
@@ -170,9 +172,20 @@ def native_readings(
     def read(
         qpos: Array, qvel: Array, qacc_warmstart: Array, act: Any, ctrl: Array
     ) -> Array:
-        return run(*_packed(qpos, qvel, qacc_warmstart, act, ctrl))
+        return run(*_packed(model, qpos, qvel, qacc_warmstart, act, ctrl))
 
     return read
+
+
+def _sizes(model: Any) -> dict[str, int]:
+    """Returns what may be read, and how much of it there is."""
+    points = {"xpos": 3, "xipos": 3, "xmat": 9, "subtree_linvel": 3}
+    return {
+        "sensordata": model.nsensordata,
+        "site_xpos": 3 * model.nsite,
+        **{name: size * model.nbody for name, size in points.items()},
+        "ncon": 1,
+    }
 
 
 def _subtree_velocity(model: Any) -> Callable[..., np.ndarray]:

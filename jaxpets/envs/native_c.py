@@ -1,6 +1,7 @@
 """C MuJoCo called by XLA itself, without Python: for programs that run on a CPU."""
 
 import ctypes
+import functools
 import hashlib
 import weakref
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
+from jaxpets._src.kernel.build import BuildError, Kernel, Kind, load_kernel
 from jaxpets.envs.extra import needs_extra
 
 with needs_extra():
@@ -34,7 +35,8 @@ def c_function(
 
     A compiled program knows it by a name, which is that of the same model and settings
     in every process. So JAX's compilation cache keeps such programs. Threads and states
-    go with the function; a program that is still called after that makes them again.
+    go with the function; a program that is still called after that makes its own, every
+    time. Functions of one model and the same settings are one, and called in turn.
 
     Args:
       model: a compiled MuJoCo model.
@@ -48,19 +50,21 @@ def c_function(
       `[I] -> [R]`, float32, or None if it cannot be built, as without a compiler. Under
       any nest of `jax.vmap` it is one call. It runs on CPUs alone and has no gradient.
     """
-    try:
-        kernel = load_kernel("", Kind.PHYSICS, needs=_flags())
-    except BuildError:
+    kernel = _kernel()
+    if kernel is None:
         return None
-    settings = (num_threads, num_substeps, *clock, len(places))
-    name = hashlib.sha256(_bytes(model) + repr((settings, places)).encode()).hexdigest()
-    arrays = (ctypes.c_char_p * len(places))(*(x.encode() for x, _ in places))
-    numbers = (ctypes.c_int * len(places))(*(place for _, place in places))
+    read = [(str(array), int(place)) for array, place in places]
+    settings = (_C.mj_versionString(), num_threads, num_substeps, *clock, read)
+    name = hashlib.sha256(_bytes(model) + repr(settings).encode()).hexdigest()
+    arrays = (ctypes.c_char_p * len(read))(*(array.encode() for array, _ in read))
+    numbers = (ctypes.c_int * len(read))(*(place for _, place in read))
     start, least = map(ctypes.c_double, clock)
-    kernel.library.jaxpets_open(
+    kernel.library.jaxpets_open.restype = ctypes.c_bool
+    if not kernel.library.jaxpets_open(
         name.encode(), ctypes.c_void_p(model._address), num_threads, num_substeps,
-        start, least, len(places), arrays, numbers,
-    )  # fmt: skip
+        start, least, len(read), arrays, numbers,
+    ):  # fmt: skip
+        raise MemoryError("there is no memory for another model of MuJoCo.")
     shape = jax.ShapeDtypeStruct((size,), jnp.float32)
     visit = jax.ffi.ffi_call(kernel.target, shape, vmap_method="broadcast_all")
 
@@ -69,6 +73,15 @@ def c_function(
 
     weakref.finalize(call, kernel.library.jaxpets_close, name.encode())
     return call
+
+
+@functools.cache
+def _kernel() -> Kernel | None:
+    """Returns what XLA calls, or None; a compiler that fails is asked once."""
+    try:
+        return load_kernel("", Kind.PHYSICS, needs=_flags())
+    except BuildError:
+        return None
 
 
 def _bytes(model: Any) -> bytes:
@@ -88,4 +101,5 @@ def _flags() -> tuple[str, ...]:
     found = [*folder.glob("libmujoco.so.*"), *folder.glob("libmujoco.*.dylib")]
     if not found or not (folder / "include").is_dir():
         raise BuildError("there is no library of MuJoCo in its package")
-    return f"-I{folder / 'include'}", str(found[0]), f"-Wl,-rpath,{folder}"
+    path = ("-Xlinker", "-rpath", "-Xlinker", str(folder))  # may have a comma in it
+    return f"-I{folder / 'include'}", str(found[0]), *path

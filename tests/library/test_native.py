@@ -286,7 +286,7 @@ def test_an_error_of_mujoco_is_told_and_the_next_call_is_right(
     step = jax.jit(jax.vmap(env.step))
     mujoco.set_mjcb_control(lambda model, data: None)  # its threads take none of Python
     try:
-        with pytest.raises(jax.errors.JaxRuntimeError, match=r"mjcb_control|MuJoCo: "):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="mjcb_control"):
             jax.block_until_ready(step(states, actions))
     finally:
         mujoco.set_mjcb_control(None)

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -135,14 +136,75 @@ def test_a_name_that_nobody_has_opened_is_an_error():
         jax.block_until_ready(call(jnp.zeros(3), name="nobody"))
 
 
+@pytest.mark.parametrize("wrong", ["qpos", "qvel", "qacc_warmstart", "act", "ctrl"])
+def test_states_of_another_size_are_refused(model, rows, wrong):
+    names = "qpos", "qvel", "qacc_warmstart", "act", "ctrl"
+    row = {name: x[0] for name, x in zip(names, rows, strict=True)}
+    row[wrong] = jnp.zeros(200)
+    size = len(rows[names.index(wrong)][0])
+    for function in (step_of(model), read_of(model)):
+        named = rf"{wrong} must have shape \[{size}\], got \[200\]"
+        with pytest.raises(ValueError, match=named):
+            function(**row)
+
+
+@needs_compiler
+def test_c_refuses_operands_of_another_size(model):
+    step = step_of(model)
+    program = jax.jit(step).lower(*jax.eval_shape(lambda: rows_of_zero(model)))
+    name = re.search(r'name = "(\w{64})"', program.as_text())[1]
+    kernel = native_c._kernel()
+    for inputs, outputs in ((200, 29), (30, 500)):
+        call = jax.ffi.ffi_call(
+            kernel.target, jax.ShapeDtypeStruct((outputs,), jnp.float32)
+        )
+        with pytest.raises(jax.errors.JaxRuntimeError, match="of another size"):
+            jax.block_until_ready(call(jnp.zeros(inputs), name=name))
+
+
+def rows_of_zero(model):
+    sizes = model.nq, model.nv, model.nv, model.na, model.nu
+    return [jnp.zeros(size) for size in sizes]
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc knows of threads")
+def test_threads_go_with_environments_and_programs(model, rows):
+    def threads():
+        return len(os.listdir("/proc/self/task"))
+
+    wide = [jnp.tile(x, (4, 1)) for x in rows]
+    jax.block_until_ready(jax.vmap(step_of(model, num_threads=1))(*wide))
+    jax.clear_caches()
+    gc.collect()
+    before = threads()
+    step = step_of(model, num_threads=5)
+    program = jax.jit(jax.vmap(step)).lower(*wide).compile()
+    jax.block_until_ready(program(*wide))
+    assert threads() == before + 4
+    del step
+    jax.clear_caches()
+    gc.collect()
+    assert threads() <= before
+    jax.block_until_ready(program(*wide))
+    assert threads() <= before
+
+
 def test_without_a_compiler_numpy_steps(model, rows, monkeypatch):
     want = jax.vmap(step_of(model))(*rows)
+    asked = []
 
     def fail(*_, **__):
+        asked.append(1)
         raise BuildError("no C++ compiler found")
 
     monkeypatch.setattr(native_c, "load_kernel", fail)
-    step = step_of(model)
+    native_c._kernel.cache_clear()
+    try:
+        step, _ = step_of(model), step_of(model)
+    finally:
+        native_c._kernel.cache_clear()
+    assert len(asked) == 1
     program = str(jax.make_jaxpr(jax.vmap(step))(*rows))
     assert "buffer_callback" in program and "jaxpets_physics" not in program
     jax.tree.map(np.testing.assert_array_equal, jax.vmap(step)(*rows), want)
@@ -203,8 +265,13 @@ def test_a_model_is_what_it_was_when_it_was_built_of(rows, monkeypatch, way):
 
 
 def test_only_what_is_known_is_read(model):
-    with pytest.raises(ValueError, match=r"places must be of sensordata.*'qfrc_bias'"):
-        native.native_readings(model, [("xpos", 3), ("qfrc_bias", 0)])
+    places = ("qfrc_bias", 0), ("xpos", 15), ("xpos", -1), ("ncon", 1)
+    for place in places:
+        named = re.escape("places must be of sensordata [7], site_xpos [3], xpos [15]")
+        with pytest.raises(
+            ValueError, match=f"{named}.*, got '{place[0]}', {place[1]}"
+        ):
+            native.native_readings(model, [("xpos", 3), place])
     late = ROBOTS.replace(
         'ctrlrange="-2 2"', 'ctrlrange="-2 2" delay="0.01" nsample="5"'
     )

@@ -1,6 +1,9 @@
 // C MuJoCo as an XLA custom call: a batch of states, by MuJoCo's own pool of threads.
 #include <algorithm>
+#include <atomic>
+#include <climits>
 #include <cmath>
+#include <exception>
 #include <map>
 #include <mutex>
 #include <string>
@@ -32,7 +35,7 @@ struct Reading {
 struct World {
   mjModel* model = nullptr;  // stays, as a program may
   mjBatch* batch = nullptr;  // as large as the largest call; goes with the last user
-  int users = 0;
+  std::atomic<int> users{0};
   int threads, substeps;     // without substeps it reads
   double start, least;       // of the clock: a state with less was reset
   std::vector<Reading> readings;
@@ -40,8 +43,9 @@ struct World {
   std::mutex turn;
 };
 
-std::map<std::string, World> worlds;
-std::mutex of_worlds;
+// Never destroyed, as a program may run while the process ends.
+auto& worlds = *new std::map<std::string, World>;
+auto& of_worlds = *new std::mutex;
 
 struct Work {
   World* world;
@@ -64,14 +68,23 @@ const char* operands(const Call& call, Work& work) {
   work.outputs = static_cast<float*>(out.data);
   work.num_inputs = int(in.dims[in.rank - 1]);
   work.num_outputs = int(out.dims[out.rank - 1]);
-  work.rows = 1;
-  for (int64_t axis = 0; axis + 1 < in.rank; ++axis) work.rows *= int(in.dims[axis]);
+  const int64_t rows = product(in, 0) / std::max<int64_t>(1, work.num_inputs);
+  if (rows > INT_MAX) return "there are more than 2^31 states";
+  work.rows = int(rows);
   return nullptr;
+}
+
+// Gives back a world's threads and states. Its turn must be held.
+void leave(World& world) {
+  if (world.batch) mjb_deleteBatch(world.batch);
+  world.batch = nullptr;
+  world.found = {};
 }
 
 // Lets a world have room for so many rows. Returns what MuJoCo says if it cannot.
 std::string make_room(World& world, int rows) {
   if (world.batch && mjb_nsim(world.batch) >= rows) return "";
+  std::vector<double> room(size_t(rows) * world.readings.size());
   mjBatchConfig config;
   mjb_defaultConfig(&config);
   config.nthread = std::min(world.threads, rows);
@@ -79,9 +92,9 @@ std::string make_room(World& world, int rows) {
   mjBatch* const larger =
       mjb_makeBatch(world.model, rows, &config, error, sizeof error);
   if (!larger) return error;
-  if (world.batch) mjb_deleteBatch(world.batch);
+  leave(world);
   world.batch = larger;
-  world.found.resize(size_t(rows) * world.readings.size());
+  world.found = std::move(room);
   return "";
 }
 
@@ -96,11 +109,20 @@ void read(const mjModel* model, mjData* data, int simulation, void* of) {
 
 // Moves or reads every row. Returns what MuJoCo says if one fails.
 std::string visit(const Work& work) {
+  // Python's would be called in threads that it does not know.
+  if (mjcb_passive || mjcb_control || mjcb_contactfilter || mjcb_sensor ||
+      mjcb_act_dyn || mjcb_act_gain || mjcb_act_bias)
+    return "it has a function to call, as mjcb_control, which is not called here";
   World& world = *work.world;
   const std::lock_guard<std::mutex> turn(world.turn);
   if (std::string problem = make_room(world, work.rows); !problem.empty())
     return problem;
   mjBatch* const batch = world.batch;
+  const size_t num_outputs = work.num_outputs;
+  if (work.num_inputs >= mjb_nstate(batch) ||
+      (world.substeps ? work.num_outputs >= mjb_nstate(batch)
+                      : num_outputs != world.readings.size()))
+    return "a state is of another size";
   std::vector<int> ids(work.rows);
   for (int row = 0; row < work.rows; ++row) {
     // A state begins with the clock, then comes what the inputs are.
@@ -119,32 +141,38 @@ std::string visit(const Work& work) {
   for (int row = 0; row < work.rows; ++row) {
     const mjtNum* const state = mjb_state(batch) + size_t(row) * mjb_nstate(batch);
     const double* const found =
-        world.substeps ? state + 1 : &world.found[size_t(row) * work.num_outputs];
-    float* const outputs = work.outputs + size_t(row) * work.num_outputs;
+        world.substeps ? state + 1 : world.found.data() + row * num_outputs;
+    float* const outputs = work.outputs + row * num_outputs;
     for (int i = 0; i < work.num_outputs; ++i)
       outputs[i] = state[0] < world.least ? NAN : float(found[i]);
   }
+  if (!world.users) leave(world);  // a program that is longer there than they
   return "";
 }
 
 XLA_FFI_Error* run(const Call& call, const Work& work) {
-  const std::string problem = work.rows ? visit(work) : "";
-  if (problem.empty()) return nullptr;
-  return failure(call, XLA_FFI_Error_Code_INTERNAL, ("MuJoCo: " + problem).c_str());
+  try {
+    const std::string problem = work.rows ? visit(work) : "";
+    if (problem.empty()) return nullptr;
+    return failure(call, XLA_FFI_Error_Code_INTERNAL, ("MuJoCo: " + problem).c_str());
+  } catch (const std::exception& error) {
+    return failure(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, error.what());
+  }
 }
 
 }  // namespace
 
 extern "C" {
 
-// Lets a name stand for a world.
-void jaxpets_open(const char* name, const mjModel* model, int threads, int substeps,
+// Lets a name stand for a world. Returns whether there was memory for it.
+bool jaxpets_open(const char* name, const mjModel* model, int threads, int substeps,
                   double start, double least, int num_readings, const char** names,
                   const int* places) {
   const std::lock_guard<std::mutex> turn(of_worlds);
   World& world = worlds[name];
   if (!world.model) {
     world.model = mj_copyModel(nullptr, model);
+    if (!world.model) return false;
     world.threads = threads;
     world.substeps = substeps;
     world.start = start;
@@ -156,16 +184,18 @@ void jaxpets_open(const char* name, const mjModel* model, int threads, int subst
     }
   }
   ++world.users;
+  return true;
 }
 
 // Called once for every `jaxpets_open`.
 void jaxpets_close(const char* name) {
-  const std::lock_guard<std::mutex> of_all(of_worlds);
-  World& world = worlds[name];
+  World& world = [name]() -> World& {
+    const std::lock_guard<std::mutex> turn(of_worlds);
+    return worlds[name];
+  }();
   if (--world.users) return;
   const std::lock_guard<std::mutex> turn(world.turn);
-  if (world.batch) mjb_deleteBatch(world.batch);
-  world.batch = nullptr;
+  if (!world.users) leave(world);  // nobody has opened it in between
 }
 
 XLA_FFI_Error* jaxpets_physics(XLA_FFI_CallFrame* call) {
