@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import jax
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 import jaxpets
-from jaxpets._src.kernel.build import BuildError, Kind, load_kernel
+from jaxpets._src.kernel.build import BuildError, Kernel, Kind, load_kernel
 from jaxpets.envs import engines, native, native_c
 
 ROBOTS = """<mujoco>
@@ -299,3 +300,14 @@ def test_a_gpu_goes_through_numpy(model, rows):
     program = jax.jit(jax.vmap(step_of(model))).trace(*rows)
     text = program.lower(lowering_platforms=("cuda",)).as_text()
     assert "xla_buffer_python_gpu_callback" in text and "jaxpets_physics" not in text
+
+
+def test_no_memory_for_a_model_is_an_error(model, monkeypatch):
+    def refuse(*_):
+        return False
+
+    library = types.SimpleNamespace(jaxpets_open=refuse)
+    kernel = Kernel("none", "none", library)
+    monkeypatch.setattr(native_c, "_kernel", lambda: kernel)
+    with pytest.raises(MemoryError, match="no memory for another model"):
+        step_of(model)
