@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from .parallel import distributed
 
-# C MuJoCo is called through Python, and would wait for 5 ms at every step.
+# Beside a GPU C MuJoCo is called through Python, and would wait for 5 ms at a step.
 _SWITCH_SECONDS = 2e-5
 
 

@@ -1,6 +1,7 @@
 """C MuJoCo inside JAX programs: physics on the cores of the host."""
 
 import copy
+import itertools
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -152,19 +153,19 @@ def native_readings(
         outs, ins = arrays.setdefault(source, ([], []))
         outs.append(i)
         ins.append(place)
-    velocity_fn = _subtree_velocity(model)
+    parts = {source: _PARTS.get(source, (source,)) for source in arrays}
+    compute_fns = {x: _subtree_velocity(model) for x in arrays if x in _PARTS}
 
     def visit(batch: Any, ids: np.ndarray) -> np.ndarray:
-        bound = {x for source in arrays for x in _PARTS.get(source, (source,))}
-        for source in bound:
-            batch.bind(source)  # so that the call copies it out
+        for part in itertools.chain(*parts.values()):
+            batch.bind(part)  # so that the call copies it out
         batch.forward(ids)
         count = len(ids)
         rows = np.empty((count, size))
         for source, (outs, ins) in arrays.items():
-            parts = [batch.bind(x)[:count] for x in _PARTS.get(source, (source,))]
-            found = velocity_fn(*parts) if source in _PARTS else parts[0]
-            rows[:, outs] = found.reshape(count, -1)[:, ins]
+            found = [batch.bind(part)[:count] for part in parts[source]]
+            whole = compute_fns[source](*found) if source in compute_fns else found[0]
+            rows[:, outs] = whole.reshape(count, -1)[:, ins]
         return rows
 
     run = _host_function(model, visit, size, num_threads, places=places)
