@@ -215,7 +215,8 @@ def _host_function(
 ) -> Callable[..., Array]:
     """Builds a function of JAX that has C MuJoCo visit every row of a batch.
 
-    On a CPU XLA calls C where there is a compiler, and else the function of NumPy here.
+    XLA calls C itself for a CPU or an NVIDIA GPU where there is a compiler, and else
+    the function of NumPy here.
 
     Args:
       model: a compiled MuJoCo model.
@@ -260,7 +261,7 @@ def _host_function(
         if by_c is None:
             return by_numpy(inputs)
         choose: Any = jax.lax.platform_dependent
-        return choose(inputs, cpu=by_c, default=by_numpy)
+        return choose(inputs, cpu=by_c, cuda=by_c, default=by_numpy)
 
     def run(*parts: Array) -> Array:
         # As one array, so that a GPU copies once each way.

@@ -54,6 +54,13 @@ class Kind(enum.Enum):
         return known.get(self.layout, "jaxpets_rollout")
 
     @property
+    def symbols(self) -> dict[str, str]:
+        """What XLA calls on each platform, by its name."""
+        if self is Kind.PHYSICS:  # which is on the host, wherever its operands are
+            return {"cpu": self.symbol, "CUDA": f"{self.symbol}_cuda"}
+        return {"CUDA" if self.is_for_gpu else "cpu": self.symbol}
+
+    @property
     def is_for_gpu(self) -> bool:
         """Whether it runs on a GPU."""
         return self.source.endswith(".cu")
@@ -109,11 +116,12 @@ def build_kernel(
     make = functools.partial(_compile, compiler, sources, kind, needs)
     try:
         with cache.library(target, make) as library:
-            loaded, handler = _loaded(library, kind)
+            loaded, handlers = _loaded(library, kind)
     except OSError as error:
         raise BuildError(f"there is no folder to build it in: {error}") from error
-    where = "CUDA" if kind.is_for_gpu else "cpu"
-    jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(handler), platform=where)
+    for platform_name, handler in handlers.items():
+        capsule = jax.ffi.pycapsule(handler)
+        jax.ffi.register_ffi_target(target, capsule, platform=platform_name)
     return Kernel(target, version, loaded)
 
 
@@ -147,18 +155,18 @@ def _compile(
     return library
 
 
-def _loaded(library: Path, kind: Kind) -> tuple[Any, Any]:
-    """Returns a library, and its kernel as a function of C."""
+def _loaded(library: Path, kind: Kind) -> tuple[Any, dict[str, Any]]:
+    """Returns a library, and what it has for each platform as functions of C."""
     try:
         loaded = ctypes.CDLL(str(library))
-        kernel = getattr(loaded, kind.symbol)
+        handlers = {name: getattr(loaded, x) for name, x in kind.symbols.items()}
     except (OSError, AttributeError) as error:
         raise BuildError(f"cannot load the compiled kernel: {error}") from error
     if kind is Kind.FIT:
         loaded.jaxpets_problem.restype = ctypes.c_char_p
         if problem := loaded.jaxpets_problem():
             raise BuildError(problem.decode())
-    return loaded, kernel
+    return loaded, handlers
 
 
 def _run(command: list[str], limit: float) -> str:

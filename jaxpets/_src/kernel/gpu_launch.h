@@ -11,13 +11,11 @@ namespace {
 template <typename Launch>
 XLA_FFI_Error* launch_on_stream(const Call& call, const void* kernel, size_t shared,
                                 Launch launch) {
-  XLA_FFI_Stream_Get_Args args = {};
-  args.struct_size = XLA_FFI_Stream_Get_Args_STRUCT_SIZE;
-  args.ctx = call.ctx;
-  if (XLA_FFI_Error* none = call.api->XLA_FFI_Stream_Get(&args)) return none;
+  void* stream;
+  if (XLA_FFI_Error* none = get_stream(call, stream)) return none;
   cudaError_t error = cudaFuncSetAttribute(
       kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared));
-  if (error == cudaSuccess) error = launch(static_cast<cudaStream_t>(args.stream));
+  if (error == cudaSuccess) error = launch(static_cast<cudaStream_t>(stream));
   if (error == cudaSuccess) error = cudaGetLastError();
   if (error == cudaSuccess) return nullptr;
   return failure(call, XLA_FFI_Error_Code_INTERNAL, cudaGetErrorString(error));

@@ -12,6 +12,7 @@
 #include <mujoco/mjbatch.h>
 #include <mujoco/mujoco.h>
 
+#include "gpu_copy.h"
 #include "xla_call.h"
 
 namespace {
@@ -160,6 +161,25 @@ XLA_FFI_Error* run(const Call& call, const Work& work) {
   }
 }
 
+// The same with operands that are on a GPU.
+XLA_FFI_Error* run_from_gpu(const Call& call, const Work& work) {
+  if (!work.rows) return nullptr;
+  try {
+    std::vector<float> inputs(size_t(work.rows) * work.num_inputs);
+    std::vector<float> outputs(size_t(work.rows) * work.num_outputs);
+    Work here = work;
+    here.inputs = inputs.data();
+    here.outputs = outputs.data();
+    const size_t in = inputs.size() * sizeof(float), out = outputs.size() * sizeof(float);
+    if (auto* error = copy(call, Way::to_host, inputs.data(), work.inputs, in))
+      return error;
+    if (auto* error = run(call, here)) return error;
+    return copy(call, Way::to_gpu, work.outputs, outputs.data(), out);
+  } catch (const std::exception& error) {
+    return failure(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, error.what());
+  }
+}
+
 }  // namespace
 
 extern "C" {
@@ -200,6 +220,10 @@ void jaxpets_close(const char* name) {
 
 XLA_FFI_Error* jaxpets_physics(XLA_FFI_CallFrame* call) {
   return handle<Work>(*call, 0, operands, run);
+}
+
+XLA_FFI_Error* jaxpets_physics_cuda(XLA_FFI_CallFrame* call) {
+  return handle<Work>(*call, 0, operands, run_from_gpu);
 }
 
 }  // extern "C"

@@ -22,6 +22,16 @@ XLA_FFI_Error* failure(const Call& call, XLA_FFI_Error_Code code, const char* me
   return call.api->XLA_FFI_Error_Create(&args);
 }
 
+// Finds the stream of a GPU that XLA calls on.
+XLA_FFI_Error* get_stream(const Call& call, void*& stream) {
+  XLA_FFI_Stream_Get_Args args = {};
+  args.struct_size = XLA_FFI_Stream_Get_Args_STRUCT_SIZE;
+  args.ctx = call.ctx;
+  XLA_FFI_Error* const error = call.api->XLA_FFI_Stream_Get(&args);
+  stream = args.stream;
+  return error;
+}
+
 int64_t product(const Operand& operand, int64_t first) {
   int64_t result = 1;
   for (int64_t i = first; i < operand.rank; ++i) result *= operand.dims[i];
