@@ -219,6 +219,9 @@ def test_shapes(tmp_path):
     assert names == ["paper", "gelu", "16 members"]
     assert found[0]["share_of_paper"] == 1.0
     assert found[1]["sizes"]["activation"] == "gelu"
+    (ten,) = shapes.main(["--shape", "paper", "--rollouts", "10", *common])
+    one = found[0]["tflops_per_s"] * found[0]["median_ms"]
+    assert ten["tflops_per_s"] * ten["median_ms"] == pytest.approx(10 * one)
     # By hand: (24 x 8 + 8 x 8 + 8 x 36) x 2 for each of 4 x 20 x 2 steps.
     shape = shapes.Shape(18, 6, (8, 8), num_samples=4, horizon=2)
     assert shapes._flops(shape) == 2 * (24 * 8 + 8 * 8 + 8 * 36) * 160
@@ -250,15 +253,15 @@ def test_the_set_for_a_gpu_is_made_of_valid_flags(monkeypatch, tmp_path):
     # Flags are parsed by the real programs; only the measuring is left out.
     monkeypatch.setattr(rows_module, "report", record)
     path = tmp_path / "rows.jsonl"
-    assert all_benchmarks.main(["--tiny", "--json", str(path)]) == ([], [])
+    assert all_benchmarks.main(["--tiny", "--json", str(path)]) == ([], [], [])
     assert seen == [path] * len(all_benchmarks.SET)
 
 
 def test_of_the_set_only_what_a_gpu_never_ran_may_be_left_out(monkeypatch, capsys):
     commands = (plan, "--seeds 1"), (plan, "--engine kernel --seeds 1"), (trace, "")
     monkeypatch.setattr(all_benchmarks, "SET", commands)
-    done, left_out = all_benchmarks.main(["--tiny", "--repeats", "1"])
-    assert [row["engine"] for row in done] == ["scan"]
+    done, by, left_out = all_benchmarks.main(["--tiny", "--repeats", "1"])
+    assert [row["engine"] for row in done] == ["scan"] and by == [(plan, "--seeds 1")]
     assert left_out == [
         "benchmarks.plan --engine kernel --seeds 1",
         "benchmarks.trace ",
@@ -274,6 +277,34 @@ def test_of_the_set_only_what_a_gpu_never_ran_may_be_left_out(monkeypatch, capsy
     monkeypatch.setattr(all_benchmarks, "SET", ((plan, "--no-such-flag"),))
     with pytest.raises(SystemExit, match="2"):
         all_benchmarks.main(["--tiny"])
+
+
+@pytest.mark.parametrize(("second", "fails"), [(1.02, []), (2.0, ["kernel"])])
+def test_what_is_slower_once_is_timed_once_more(second, fails):
+    """The host was slow for a while, or the program is; another is slower by chance."""
+    size = workloads.named_size("paper").num_samples
+    sizes = {"num_samples": size, "precision": "bf16", "seeds": 1, "plans": 1}
+
+    def row(engine, ms):
+        return {"benchmark": "plan", "device": "gpu", "git": "a", "min_ms": ms,
+                "median_ms": ms, "sizes": {**sizes, "engine": engine}}  # fmt: skip
+
+    def day(kernel, other):
+        return [row("scan", 10.0), row("kernel", kernel), row("sm_90", other)]
+
+    commands = [(plan, name) for name in ("scan", "both", "both")]
+    ran = []
+
+    def again(commands):
+        ran.extend(commands)
+        return all_benchmarks.Outcome(day(second, 2.0), [], [])
+
+    today = all_benchmarks.Outcome(day(1.5, 1.0), commands, [])
+    found = all_benchmarks.slower(today, day(1.0, 1.0), again)
+    assert [x["sizes"]["engine"] for x in found] == fails
+    assert ran == [all_benchmarks.UNIT, (plan, "both")]
+    same = all_benchmarks.Outcome(day(1.0, 1.0), commands, [])
+    assert all_benchmarks.slower(same, day(1.0, 1.0), again) == [] and len(ran) == 2
 
 
 def test_a_row_is_on_disk_before_the_next_is_measured(tmp_path):
