@@ -247,7 +247,7 @@ class Evaluation:
     task_length: Steps = 1000
     """Environment steps per trial of zero-shot and finetune."""
     eval_trials: Annotated[TaskTrials, COUNTED] = 5
-    """zero-shot, distill: trials per task and seed."""
+    """zero-shot, distill: trials per task and seed; policies learn from them, too."""
     pessimism: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
     """How many standard deviations between members a task's reward is lowered by."""
     refit: TrainingConfig = TrainingConfig(400, 128, final_rate=0.005)
