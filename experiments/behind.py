@@ -1,14 +1,10 @@
 """What is done behind the caller's back: the last call, while the caller goes on."""
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from .parallel import distributed
-
-# Beside a GPU C MuJoCo is called through Python, and would wait for 5 ms at a step.
-_SWITCH_SECONDS = 2e-5
 
 
 class Behind:
@@ -44,12 +40,7 @@ class Behind:
 @contextlib.contextmanager
 def behind() -> Iterator[Behind]:
     """Gives a thread, which is done on return, also where the caller has failed."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(_SWITCH_SECONDS)
-    try:
-        with ThreadPoolExecutor(1, "jaxpets-behind") as pool:
-            found = Behind(pool)
-            yield found
-            found.wait()
-    finally:
-        sys.setswitchinterval(before)
+    with ThreadPoolExecutor(1, "jaxpets-behind") as pool:
+        found = Behind(pool)
+        yield found
+        found.wait()

@@ -1,6 +1,5 @@
 """What is done behind a loop's back: `experiments.behind`."""
 
-import sys
 import threading
 import time
 
@@ -98,13 +97,3 @@ def test_with_other_processes_a_call_is_done_on_return(monkeypatch):
     with behind() as saving:
         saving.call(lambda: (time.sleep(0.02), done.append(1))[0])
         assert done == [1]
-
-
-def test_pythons_lock_changes_hands_often_and_only_here():
-    before = sys.getswitchinterval()
-    with behind():
-        assert sys.getswitchinterval() < 1e-4
-    assert sys.getswitchinterval() == before
-    with pytest.raises(OSError), behind():
-        fail()
-    assert sys.getswitchinterval() == before
