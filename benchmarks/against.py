@@ -40,15 +40,21 @@ def pairs(today: Sequence[Row], committed: Iterable[Row]) -> Iterator[Pair]:
     """Yields a pair per row of today that has a time; rows of other devices are new."""
     before: dict[str, tuple[Row, float | None]] = {}
     for row, unit in _with_unit(committed):
-        replaces = unit is not None or _key(row) not in before
+        replaces = unit is not None or key(row) not in before
         if row["device"] == today[0]["device"] and replaces:
-            before[_key(row)] = row, unit
+            before[key(row)] = row, unit
     for row, unit in _with_unit(today):
-        then, unit_then = before.get(_key(row), (None, None))
+        then, unit_then = before.get(key(row), (None, None))
         speed = None
         if then and unit and unit_then:
             speed = unit / row["min_ms"] / (unit_then / then["min_ms"])
         yield Pair(row, then, speed)
+
+
+def key(row: Row) -> str:
+    """Returns what a row is of: a program and its sizes."""
+    sizes = {"engine": "scan", **row["sizes"]}  # fits before there was a kernel
+    return json.dumps([row["benchmark"], sizes], sort_keys=True)
 
 
 def committed_rows(folder: Path = RESULTS) -> list[Row]:
@@ -62,7 +68,7 @@ def committed_rows(folder: Path = RESULTS) -> list[Row]:
 
 
 def report(today: Sequence[Row], committed: Sequence[Row]) -> list[Row]:
-    """Prints today's rows beside the committed ones, then the plans of other systems.
+    """Prints today's rows beside the committed ones.
 
     Returns:
       The rows whose speed is below nine tenths of the committed one.
@@ -76,12 +82,15 @@ def report(today: Sequence[Row], committed: Sequence[Row]) -> list[Row]:
         cells.append(f"{then['median_ms']:>10.4g}" if then else f"{'-':>10}")
         cells.append(f"{speed:>6.2f}" if speed else f"{'-':>6}")
         print(*cells, row["benchmark"], _text(row), sep="  ")
-    device = today[0]["device"]
+    return [pair.row for pair in found if pair.speed and pair.speed < SLOWER]
+
+
+def peers(committed: Sequence[Row], device: str) -> None:
+    """Prints the plans of other systems on such a device."""
     for row in committed:
         if "source" in row and row["device"] == device:
             print(f"{row['ms_per_plan']:>10.4g}  {row['name']}, {row['engine']}, "
                   f"{row['dtype']}, {row['seeds']} seeds: {row['source']}")  # fmt: skip
-    return [pair.row for pair in found if pair.speed and pair.speed < SLOWER]
 
 
 def _with_unit(rows: Iterable[Row]) -> Iterator[tuple[Row, float | None]]:
@@ -115,11 +124,6 @@ def _is_loop(row: Row) -> bool:
 
 def _engine(row: Row) -> str:
     return row["sizes"].get("engine", "")
-
-
-def _key(row: Row) -> str:
-    sizes = {"engine": "scan", **row["sizes"]}  # fits before there was a kernel
-    return json.dumps([row["benchmark"], sizes], sort_keys=True)
 
 
 def _text(row: Row) -> str:

@@ -40,6 +40,7 @@ Call = Callable[[], np.ndarray]
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row."""
     size = workloads.chosen_size(args)
+    size = dataclasses.replace(size, num_samples=args.num_samples or size.num_samples)
     planner = workloads.planner(
         size, args.precision, args.optimizer, args.reward, engine=args.engine
     )
@@ -177,6 +178,9 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Parses the flags, measures and reports."""
     parser = rows.parser(__doc__)
     workloads.add_size_flag(parser)
+    parser.add_argument(
+        "--num-samples", type=rows.positive, help="candidates, in place of the size's"
+    )
     parser.add_argument(
         "--optimizer", choices=workloads.OPTIMIZERS, default="icem", help="search"
     )

@@ -17,7 +17,7 @@ import jax
 
 from benchmarks import against, env, fit, plan, rollout, rows, trace
 
-Row = dict[str, Any]
+Row = against.Row
 Command = tuple[Any, str]  # a module of this folder, and its flags
 
 # A program that cannot run is left out, so kernels have entries of their own.
@@ -86,7 +86,7 @@ def slower(
     committed: Sequence[Row],
     again: Callable[[Sequence[Command]], Outcome],
 ) -> list[Row]:
-    """Returns the rows that are slower than the committed ones, twice.
+    """Returns the rows that are slower than the committed ones, and are so again.
 
     Args:
       outcome: of the set.
@@ -99,9 +99,10 @@ def slower(
     if not commands:
         return []
     print("\nwhat is slower is timed once more\n", flush=True)
-    twice = against.report(again([UNIT, *dict.fromkeys(commands)]).rows, committed)
-    known = [(row["benchmark"], row["sizes"]) for row in once]
-    return [row for row in twice if (row["benchmark"], row["sizes"]) in known]
+    rows_again = again([UNIT, *dict.fromkeys(commands)]).rows
+    twice = against.report(rows_again, committed)
+    quick = {*map(against.key, rows_again)} - {*map(against.key, twice)}
+    return [row for row in once if against.key(row) not in quick]
 
 
 def gone(left_out: Sequence[str], committed: Sequence[Row], device: str) -> list[str]:
@@ -125,8 +126,9 @@ if __name__ == "__main__":
         f"slower: {row['benchmark']} {row['sizes']}"
         for row in slower(found, before, functools.partial(main, None))
     ]
+    kind = jax.devices()[0].device_kind
+    against.peers(before, kind)
     if jax.default_backend() == "gpu":
-        kind = jax.devices()[0].device_kind
         failed += [f"gone: {x}" for x in gone(found.left_out, before, kind)]
     for line in failed:
         print(line, file=sys.stderr)

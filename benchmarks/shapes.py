@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser = rows.parser(__doc__)
     parser.add_argument("--shape", nargs="+", choices=SHAPES, default=list(SHAPES))
     parser.add_argument("--precision", choices=workloads.PRECISIONS, default="bf16")
-    parser.add_argument("--rollouts", type=int, default=1, help="of one call")
+    parser.add_argument("--rollouts", type=rows.positive, default=1, help="of one call")
     parser.add_argument("--arch", help="as sm_90: Hopper without its own instructions")
     args = parser.parse_args(argv)
     return rows.report(run(args), COLUMNS, args.json)

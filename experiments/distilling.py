@@ -36,7 +36,7 @@ from .acting import Actors, Scorer, Trials
 from .build import DISTILL, Parts, State, build, key_per, trial_keys
 from .config import Config
 from .engines import say_engines
-from .model_file import ModelFile, Source
+from .model_file import Source
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
 from .phases import placed
@@ -51,9 +51,6 @@ _SEEDS = P(SEED)
 # What the log calls who acts: the planner, the policy, and the planner whose search
 # begins with what the policy would do.
 _PLANNER, _POLICY, _BOTH = WHO = ("plan", "policy", "both")
-# Trials of each task by the planner, at least, where a model comes without the data it
-# explored. What is asked for as evaluation does not decide what there is to learn from.
-_LEAST_PLANNED = 5
 
 
 class _Run(NamedTuple):
@@ -120,16 +117,14 @@ def distill(
     with progress.interruptible():
         found = kept_networks.restored(run, _template(now))
         state = found or _explored(now, source)
-        least = _LEAST_PLANNED if isinstance(source, ModelFile) else 0
-        planned = _perform(now, _PLANNER, state, 0, max(count, least))
-        shown = jax.tree.map(lambda x: x[:, :, :count], planned)
-        progress.line(_returns(now, "the planner", _rows(now, _PLANNER, shown)))
+        planned = _perform(now, _PLANNER, state, 0, count)
+        progress.line(_returns(now, "the planner", _rows(now, _PLANNER, planned)))
         if not found:
             learned = _learned(now, state, planned)
             state = exploration.model_of(state)._replace(reward=learned)
             run.save(step, state)
         acted = {
-            _PLANNER: shown,
+            _PLANNER: planned,
             _POLICY: _perform(now, _POLICY, state, turns, count),
             _BOTH: _perform(now, _BOTH, state, turns + 1, count),
         }

@@ -131,12 +131,12 @@ def _planning() -> Iterator[Finding]:
 
 
 def _compilers() -> Iterator[Finding]:
-    """What kernels are built with: C++ on a CPU, nvcc on a GPU."""
+    """What C MuJoCo and a CPU's kernels are built with, C++, and a GPU's, nvcc."""
     import jax
 
     on_gpu = jax.default_backend() == "gpu"
     for what, names, needed, advice in (
-        ("C++ compiler", _COMPILERS, not on_gpu, "apt-get install g++"),
+        ("C++ compiler", _COMPILERS, True, "apt-get install g++"),
         ("nvcc", ("nvcc",), on_gpu, "install the CUDA toolkit, or jaxpets[cuda13]"),
     ):
         found = next(filter(None, map(shutil.which, names)), None)

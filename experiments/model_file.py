@@ -207,7 +207,8 @@ def config_of(path: Path, config: Config) -> Config:
     """Returns what a run with this model would have been started with.
 
     What the file does not say is that of the preset `laptop`: a task is performed
-    once, and planned with the file's own search.
+    once, and planned with the file's own search. A policy learns from what its planner
+    does, as a file has no data, so that it performs five times.
 
     Args:
       path: of the file.
@@ -235,7 +236,7 @@ def config_of(path: Path, config: Config) -> Config:
     own_config = dataclasses.replace(
         from_json(given, default, said),
         engine="mujoco",
-        eval_trials=1,
+        eval_trials=5 if config.phase == "distill" else 1,
         model=sizes,
         refit=dataclasses.replace(default.refit, num_epochs=0),  # as it performed
         planner=search,

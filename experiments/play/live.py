@@ -1,6 +1,7 @@
 """A robot that plans: a plan and what it imagines, then a step of the world.
 
-Two programs, as one that calls C MuJoCo cannot be kept by JAX between two processes.
+Two programs, as JAX keeps none that calls Python between two processes, and the step of
+C MuJoCo does where there is no C++ compiler.
 """
 
 from collections.abc import Callable

@@ -163,8 +163,8 @@ def half_cheetah_native(*, num_threads: int | None = None) -> Env:
 
     For batches too small to fill a GPU: every step is computed on the host, in double
     precision, while the device waits. A state that has blown up is NaN from there on,
-    as with MJX. JAX needs its CPU backend for this, so a JAX_PLATFORMS that is set must
-    list cpu.
+    as with MJX. Without a C++ compiler JAX needs its CPU backend for this, so that a
+    JAX_PLATFORMS that is set must list cpu.
 
     Args:
       num_threads: over which a batch is spread; by default all cores.

@@ -17,7 +17,7 @@ def host_call(
     """Builds a function of JAX that is a function of NumPy on the host.
 
     On a CPU nothing is between but a copy; `jax.pure_callback`, which is used
-    elsewhere, first makes arrays of JAX of what NumPy reads.
+    rows_of, first makes arrays of JAX of what NumPy reads.
 
     Args:
       function: `[..., I] -> [..., size]`, float32. What it gets may not be written to,
@@ -29,10 +29,11 @@ def host_call(
       `[I] -> [size]`, float32. A call fails if it gets another number of axes, or if
       `function` returns another shape. Under any nest of `jax.vmap` the host is called
       once for the whole batch; of a program over several devices each calls it, under
-      `jax.shard_map` with its own share. It has no gradient.
+      `jax.shard_map` with its own share. What is called eagerly must be on the default
+      device. It has no gradient.
     """
 
-    def elsewhere(inputs: Any) -> np.ndarray:
+    def rows_of(inputs: Any) -> np.ndarray:
         rows = np.asarray(inputs)
         rows.flags.writeable = False
         outputs = np.ascontiguousarray(function(rows), np.float32)
@@ -44,12 +45,12 @@ def host_call(
         return outputs
 
     def here(context: Any, out: Any, inputs: Any) -> None:
-        np.asarray(out)[...] = elsewhere(inputs)
+        np.asarray(out)[...] = rows_of(inputs)
 
     shape = jax.ShapeDtypeStruct((size,), jnp.float32)
     vmapped: Any = {"vmap_method": "broadcast_all"}
     direct: Any = cast(Any, buffer_callback)(here, shape, **vmapped)
-    default = functools.partial(jax.pure_callback, elsewhere, shape, **vmapped)
+    default = functools.partial(jax.pure_callback, rows_of, shape, **vmapped)
 
     def call(inputs: Array) -> Array:
         if inputs.ndim != 1:  # which would be taken for rows

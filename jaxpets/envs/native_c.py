@@ -1,4 +1,4 @@
-"""C MuJoCo called by XLA itself, without Python: for programs that run on a CPU."""
+"""C MuJoCo called by XLA itself, without Python: on CPUs and beside NVIDIA's GPUs."""
 
 import ctypes
 import functools
@@ -48,7 +48,8 @@ def c_function(
 
     Returns:
       `[I] -> [R]`, float32, or None if it cannot be built, as without a compiler. Under
-      any nest of `jax.vmap` it is one call. It runs on CPUs alone and has no gradient.
+      any nest of `jax.vmap` it is one call. It has no gradient, and runs on CPUs and
+      NVIDIA GPUs, where rows are copied to the host and back.
     """
     kernel = _kernel()
     if kernel is None:

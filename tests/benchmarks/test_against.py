@@ -78,7 +78,10 @@ def test_what_became_slower_is_returned_and_all_is_printed(tmp_path, capsys):
     (tmp_path / "card.jsonl").write_text("\n".join(map(json.dumps, lines)))
     (tmp_path / "peers.jsonl").write_text(json.dumps(rival))
     today = [plain(10.0), row(2.2, "fit", seeds=1), row(4.6, "fit", seeds=4)]
-    (slower,) = against.report(today, against.committed_rows(tmp_path))
+    committed = against.committed_rows(tmp_path)
+    (slower,) = against.report(today, committed)
+    against.peers(committed, "card")
+    against.peers(committed, "another card")
     assert slower["sizes"] == {"seeds": 4}
     text = capsys.readouterr().out.splitlines()
     assert text[2].split() == ["2.75", "2.5", "0.91", "fit", "seeds=1"]

@@ -157,7 +157,8 @@ def test_ratios(tmp_path):
 def test_agent(tmp_path):
     path = tmp_path / "rows.jsonl"
     flags = ["--engine", "scan", "--optimizer", "cem", "--repeats", "3", "--json"]
-    (row,) = agent.main(["--tiny", *flags, str(path)])
+    (row,) = agent.main(["--tiny", "--num-samples", "9", *flags, str(path)])
+    assert row["sizes"]["num_samples"] == 9
     assert json.loads(path.read_text()) == json.loads(json.dumps(row))
     assert 0 < row["plan_ms"] <= row["plan_p99_ms"]
     assert 0 < row["act_ms"] <= row["act_p99_ms"]

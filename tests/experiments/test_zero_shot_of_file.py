@@ -11,7 +11,7 @@ import pytest
 import runs
 
 import jaxpets
-from experiments import cli, distilling, exploration, model_file
+from experiments import cli, exploration, model_file
 from experiments.build import build, ensemble_config
 from experiments.config import Config
 from experiments.entries import to_json
@@ -260,6 +260,8 @@ def test_what_is_shipped_can_perform(name):
     config = cli.parse(["zero-shot", "--from", f"pretrained/{name}"])
     want = name if name.startswith("dmc/") else "pets/half_cheetah"
     assert (config.env, config.eval_trials, config.refit.num_epochs) == (want, 1, 0)
+    learns = cli.parse(["distill", "--from", f"pretrained/{name}"])
+    assert learns.eval_trials == 5  # all that a policy of a file learns from
     assert config.task_planner.horizon >= 20
     assert cli.results_folder(config).name == f"pretrained-{name.replace('/', '-')}"
     assert models.path(name).stat().st_size < 3e6
@@ -348,23 +350,3 @@ def test_a_policy_that_will_not_do_is_refused_before_work_begins(
     critic = ("--critic.num-updates", "9", "--policy", "pretrained/best")
     assert zero_shot(explored, tmp_path, *critic, "--tag", "both") == 2
     assert "None with a critic" in capsys.readouterr().err.splitlines()[-1]
-
-
-@pytest.mark.slow
-def test_what_is_shown_does_not_decide_what_a_policy_learns(
-    file, tmp_path, monkeypatch
-):
-    """A file has no data: a policy imagines from what the planner did."""
-    learned, found = distilling._learned, []
-
-    def counted(now, state, planned):
-        found.append(planned.values.shape[:3])
-        return learned(now, state, planned)
-
-    monkeypatch.setattr(distilling, "_learned", counted)
-    critic = "--distill.critic.num-updates", "5", "--distill.critic.batch-size", "6"
-    command = ["distill", "--from", str(file), "--out", str(tmp_path), *SMALL]
-    assert main([*command, *critic, "--distill.num-rounds", "0"]) == 0
-    assert found == [(1, 1, 5)]
-    (log,) = tmp_path.rglob("metrics.jsonl")
-    assert [row["planner"] for row in runs.rows(log.parent)] == [*distilling.WHO]

@@ -90,8 +90,9 @@ def registered(monkeypatch):
 def tiny(tmp_path_factory):
     """A library with the kernels' symbols, and nothing in it."""
     folder = tmp_path_factory.mktemp("tiny")
-    symbols = ("int jaxpets_rollout", "int jaxpets_fit", "char* jaxpets_problem")
-    lines = [f"{symbol}(void) {{ return 0; }}" for symbol in symbols]
+    symbols = "rollout", "fit", "physics", "physics_cuda"
+    lines = [f"int jaxpets_{symbol}(void) {{ return 0; }}" for symbol in symbols]
+    lines.append("char* jaxpets_problem(void) { return 0; }")
     (folder / "tiny.c").write_text("\n".join(lines))
     command = ["cc", "-shared", "-fPIC", "-o", folder / "tiny.so", folder / "tiny.c"]
     subprocess.run(command, check=True)

@@ -87,26 +87,26 @@ def test_another_recipe_is_another_kernel(
 
 
 @pytest.mark.parametrize(
-    ("kind", "program", "source", "registry"),
+    ("kind", "program", "source", "platforms"),
     [
-        (Kind.WGMMA, "nvcc", "wgmma_rollout.cu", "CUDA"),
-        (Kind.MMA, "nvcc", "mma_rollout.cu", "CUDA"),
-        (Kind.WGMMA_REFERENCE, "c++", "gpu_reference.cc", "cpu"),
-        (Kind.CPU, "c++", "cpu_rollout.cc", "cpu"),
-        (Kind.FIT, "nvcc", "fit_epoch.cu", "CUDA"),
-        (Kind.FIT_REFERENCE, "c++", "fit_reference.cc", "cpu"),
+        (Kind.WGMMA, "nvcc", "wgmma_rollout.cu", ["CUDA"]),
+        (Kind.MMA, "nvcc", "mma_rollout.cu", ["CUDA"]),
+        (Kind.WGMMA_REFERENCE, "c++", "gpu_reference.cc", ["cpu"]),
+        (Kind.CPU, "c++", "cpu_rollout.cc", ["cpu"]),
+        (Kind.FIT, "nvcc", "fit_epoch.cu", ["CUDA"]),
+        (Kind.FIT_REFERENCE, "c++", "fit_reference.cc", ["cpu"]),
+        (Kind.PHYSICS, "c++", "physics.cc", ["cpu", "CUDA"]),
     ],
 )
 def test_every_kind_is_a_library_of_its_own(
-    cache, compiler, making, registered, kind, program, source, registry
+    cache, compiler, making, registered, kind, program, source, platforms
 ):
     file = compiler(making.script, name=program)
     target = load("// one", kind).target
     ((name, *_, last),) = making.commands
     assert name == str(file) and Path(last).name == source
     assert target.startswith(f"{kind.symbol}_{kind.name.lower()}_")
-    assert kind.symbol == f"jaxpets_{'fit' if 'FIT' in kind.name else 'rollout'}"
-    assert registered == [(target, registry)]
+    assert registered == [(target, platform) for platform in platforms]
     assert kept(cache) == [target]
     (library,) = cache.iterdir()
     ctypes.CDLL(str(library))

@@ -304,6 +304,51 @@ def test_no_python_is_called(model, rows, platform):
     assert "jaxpets_physics" in text and "python" not in text
 
 
+@needs_compiler
+def test_without_a_stream_there_is_nothing_to_copy(model):
+    """What is for a GPU, called on a CPU: it is an error, and no rows are none."""
+    program = jax.jit(step_of(model)).trace(*rows_of_zero(model))
+    name = re.search(r'name = "(\w{64})"', program.lower().as_text())[1]
+    handler = native_c._kernel().library.jaxpets_physics_cuda
+    jax.ffi.register_ffi_target(
+        "physics_without_a_stream", jax.ffi.pycapsule(handler), platform="cpu"
+    )
+
+    def call(count):
+        shape = jax.ShapeDtypeStruct((count, 29), jnp.float32)
+        visit = jax.ffi.ffi_call("physics_without_a_stream", shape)
+        return jax.block_until_ready(visit(jnp.zeros((count, 31)), name=name))
+
+    assert call(0).shape == (0, 29)
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        call(3)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_a_gpu_gets_what_c_does(model, rows, count):
+    part = [x[:count] for x in rows]
+    gpu, cpu = jax.devices("gpu")[0], jax.devices("cpu")[0]
+    for function in (step_of(model), read_of(model)):
+        call = jax.jit(jax.vmap(function))
+        got, want = (call(*jax.device_put(part, device)) for device in (gpu, cpu))
+        assert all(x.devices() == {gpu} for x in jax.tree.leaves(got))
+        jax.tree.map(np.testing.assert_array_equal, got, want)
+
+
+@pytest.mark.gpu
+def test_an_error_of_c_is_told_beside_a_gpu(model, rows):
+    call = jax.jit(jax.vmap(step_of(model)))
+    given = jax.device_put(rows, jax.devices("gpu")[0])
+    mujoco.set_mjcb_control(lambda model, data: None)
+    try:
+        with pytest.raises(jax.errors.JaxRuntimeError, match="mjcb_control"):
+            jax.block_until_ready(call(*given))
+    finally:
+        mujoco.set_mjcb_control(None)
+    assert np.isfinite(call(*given)[0]).all()
+
+
 def test_no_memory_for_a_model_is_an_error(model, monkeypatch):
     def refuse(*_):
         return False

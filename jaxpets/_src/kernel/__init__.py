@@ -39,7 +39,8 @@ Who includes whom:
     gpu_particles.h     handler.h: what a warp or a block does with its particles
     gpu_reference.cc    gpu_layout.h, handler.h
     cpu_rollout.cc      cpu_layout.h, handler.h
-    physics.cc          xla_call.h, and C MuJoCo
+    physics.cc          gpu_copy.h, and C MuJoCo
+    gpu_copy.h          xla_call.h: copies between a GPU and the host
     fit_epoch.cu        fit_epoch.h, gpu_launch.h
     fit_reference.cc    fit_epoch.h
     fit_epoch.h         fit_forward.h, fit_backward.h, fit_state.h: parts of an epoch

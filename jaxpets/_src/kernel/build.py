@@ -49,13 +49,13 @@ class Kind(enum.Enum):
 
     @property
     def symbol(self) -> str:
-        """What XLA calls."""
+        """What a target's name begins with, and but for `symbols` a function's is."""
         known = {"fit": "jaxpets_fit", "physics": "jaxpets_physics"}
         return known.get(self.layout, "jaxpets_rollout")
 
     @property
     def symbols(self) -> dict[str, str]:
-        """What XLA calls on each platform, by its name."""
+        """The functions that XLA calls, by their platforms."""
         if self is Kind.PHYSICS:  # which is on the host, wherever its operands are
             return {"cpu": self.symbol, "CUDA": f"{self.symbol}_cuda"}
         return {"CUDA" if self.is_for_gpu else "cpu": self.symbol}

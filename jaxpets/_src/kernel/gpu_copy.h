@@ -12,12 +12,15 @@ namespace {
 enum class Way { to_host, to_gpu };
 
 // Calls CUDA's driver, which is there wherever XLA has such a GPU, so that nothing is
-// linked for it. Returns its error, or -1 if there is none to call.
+// linked for it. Returns what failed.
 template <typename... Arguments>
-int driver(const char* name, Arguments... arguments) {
+std::string driver(const char* name, Arguments... arguments) {
   static void* const library = dlopen("libcuda.so.1", RTLD_NOW);
   void* const found = library ? dlsym(library, name) : nullptr;
-  return found ? reinterpret_cast<int (*)(Arguments...)>(found)(arguments...) : -1;
+  if (!found) return std::string("there is no ") + name + " of a GPU's driver";
+  const int error = reinterpret_cast<int (*)(Arguments...)>(found)(arguments...);
+  if (!error) return "";
+  return name + (" of the GPU's driver failed with " + std::to_string(error));
 }
 
 // Copies, and waits for it and for all that the stream was given before. Returns what
@@ -27,13 +30,13 @@ XLA_FFI_Error* copy(const Call& call, Way way, void* to, const void* from,
   void* stream;
   if (XLA_FFI_Error* none = get_stream(call, stream)) return none;
   // The driver takes a place on a GPU as a number.
-  int error = way == Way::to_host
-                  ? driver("cuMemcpyDtoHAsync_v2", to, uint64_t(from), bytes, stream)
-                  : driver("cuMemcpyHtoDAsync_v2", uint64_t(to), from, bytes, stream);
-  if (!error) error = driver("cuStreamSynchronize", stream);
-  if (!error) return nullptr;
-  const std::string said = "the GPU's driver failed with " + std::to_string(error);
-  return failure(call, XLA_FFI_Error_Code_INTERNAL, said.c_str());
+  std::string problem =
+      way == Way::to_host
+          ? driver("cuMemcpyDtoHAsync_v2", to, uint64_t(from), bytes, stream)
+          : driver("cuMemcpyHtoDAsync_v2", uint64_t(to), from, bytes, stream);
+  if (problem.empty()) problem = driver("cuStreamSynchronize", stream);
+  if (problem.empty()) return nullptr;
+  return failure(call, XLA_FFI_Error_Code_INTERNAL, problem.c_str());
 }
 
 }  // namespace
