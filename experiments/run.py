@@ -85,9 +85,11 @@ def _dispatch(config: Config, watch: Watch) -> None:
 
 def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
     """Runs a phase that leaves a folder; `with_gl` allows what comes after OpenGL."""
+    from . import programs
     from .storage.folder import RunFolder
 
     check_cpu(config)
+    programs.keep_on_gpu()
     path = cli.explored_run(config)
     source: Source = ModelFile(path) if path.is_file() else RunFolder(path)
     if config.phase == "explore":

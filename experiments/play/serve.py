@@ -1,19 +1,16 @@
 """Puts a page together and keeps it up."""
 
 import dataclasses
-import os
 import secrets
 import socket
-import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import viser
 
-from .. import build
+from .. import build, programs
 from ..errors import UsageError
 from ..policy import of_file
 from . import command, source
@@ -58,7 +55,7 @@ def serve(
     Raises:
       RunError: if there is no such model or run, or the address is not to be had.
     """
-    _keep_programs()
+    programs.keep()
     token = secrets.token_urlsafe(16) if options.host else ""
     listener, address = _opened(options)
     with serving(listener, token) as server:
@@ -137,24 +134,3 @@ def _opened(options: Options) -> tuple[socket.socket, str]:
 def _listener(host: str, port: int) -> socket.socket:
     family, *_, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
     return socket.create_server((address[0], port), family=family)
-
-
-def _keep_programs() -> None:
-    """Has JAX keep what it compiles for the next time, in a folder of the user's own.
-
-    To load a program is to run it: where others may write, nothing is kept.
-    """
-    config: Any = jax.config
-    if config.jax_compilation_cache_dir:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home, "jaxpets", "programs")
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
-    except OSError:
-        return
-    others = stat.S_IWGRP | stat.S_IWOTH
-    if found.st_uid == os.getuid() and not found.st_mode & others:
-        config.update("jax_compilation_cache_dir", str(folder))
-        config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -711,21 +711,3 @@ def test_a_file_of_a_model_runs_no_file(cheetah, tmp_path):
         jaxpets.save_model(path, model, params, about=about)
         with pytest.raises(error or CheckpointError):
             source.found(str(path))
-
-
-def test_programs_are_kept_where_nobody_else_writes(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    before = jax.config.jax_compilation_cache_dir
-    seconds = jax.config.jax_persistent_cache_min_compile_time_secs
-    try:
-        jax.config.update("jax_compilation_cache_dir", None)
-        (tmp_path / "jaxpets" / "programs").mkdir(parents=True)
-        (tmp_path / "jaxpets" / "programs").chmod(0o777)
-        serve._keep_programs()
-        assert jax.config.jax_compilation_cache_dir is None
-        (tmp_path / "jaxpets" / "programs").chmod(0o700)
-        serve._keep_programs()
-        assert jax.config.jax_compilation_cache_dir.startswith(str(tmp_path))
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)
