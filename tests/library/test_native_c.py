@@ -304,26 +304,6 @@ def test_no_python_is_called(model, rows, platform):
     assert "jaxpets_physics" in text and "python" not in text
 
 
-@needs_compiler
-def test_without_a_stream_there_is_nothing_to_copy(model):
-    """What is for a GPU, called on a CPU: it is an error, and no rows are none."""
-    program = jax.jit(step_of(model)).trace(*rows_of_zero(model))
-    name = re.search(r'name = "(\w{64})"', program.lower().as_text())[1]
-    handler = native_c._kernel().library.jaxpets_physics_cuda
-    jax.ffi.register_ffi_target(
-        "physics_without_a_stream", jax.ffi.pycapsule(handler), platform="cpu"
-    )
-
-    def call(count):
-        shape = jax.ShapeDtypeStruct((count, 29), jnp.float32)
-        visit = jax.ffi.ffi_call("physics_without_a_stream", shape)
-        return jax.block_until_ready(visit(jnp.zeros((count, 31)), name=name))
-
-    assert call(0).shape == (0, 29)
-    with pytest.raises(jax.errors.JaxRuntimeError):
-        call(3)
-
-
 @pytest.mark.gpu
 @pytest.mark.parametrize("count", [0, 1, 40])
 def test_a_gpu_gets_what_c_does(model, rows, count):
