@@ -17,12 +17,14 @@ def keep() -> None:
     config: Any = jax.config
     if config.jax_compilation_cache_dir:
         return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home, "jaxpets", "programs")
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home, "jaxpets", "programs")
+        # Whatever the umask is: kernels are kept in the one above, if it is private.
+        for path in reversed((folder, *folder.parents)):
+            path.mkdir(mode=0o700, exist_ok=True)
         found = folder.stat()
-    except OSError:
+    except (OSError, RuntimeError):  # the latter where there is no home folder
         return
     others = stat.S_IWGRP | stat.S_IWOTH
     if found.st_uid == os.getuid() and not found.st_mode & others:

@@ -17,7 +17,7 @@ def host_call(
     """Builds a function of JAX that is a function of NumPy on the host.
 
     On a CPU nothing is between but a copy; `jax.pure_callback`, which is used
-    rows_of, first makes arrays of JAX of what NumPy reads.
+    elsewhere, first makes arrays of JAX of what NumPy reads.
 
     Args:
       function: `[..., I] -> [..., size]`, float32. What it gets may not be written to,

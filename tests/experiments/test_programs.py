@@ -1,5 +1,8 @@
 """Compiled programs that are kept: `experiments.programs`."""
 
+import os
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -45,6 +48,27 @@ def test_nothing_is_kept_where_others_write(folder):
     folder.chmod(0o700)
     programs.keep()
     assert jax.config.jax_compilation_cache_dir == str(folder)
+
+
+def test_folders_are_private_whatever_the_umask_is(folder):
+    """Kernels are kept in the one above, if nobody else may write there."""
+    before = os.umask(0o002)
+    try:
+        programs.keep()
+    finally:
+        os.umask(before)
+    assert {x.stat().st_mode & 0o777 for x in (folder, folder.parent)} == {0o700}
+    assert jax.config.jax_compilation_cache_dir == str(folder)
+
+
+def test_without_a_home_nothing_is_kept(folder, monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    programs.keep()
+    assert jax.config.jax_compilation_cache_dir is None
 
 
 def test_a_home_that_cannot_be_written_is_no_error(folder):

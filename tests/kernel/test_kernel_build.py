@@ -106,6 +106,8 @@ def test_every_kind_is_a_library_of_its_own(
     ((name, *_, last),) = making.commands
     assert name == str(file) and Path(last).name == source
     assert target.startswith(f"{kind.symbol}_{kind.name.lower()}_")
+    others = (name for name in ("fit", "physics") if name.upper() in kind.name)
+    assert kind.symbol == f"jaxpets_{next(others, 'rollout')}"
     assert registered == [(target, platform) for platform in platforms]
     assert kept(cache) == [target]
     (library,) = cache.iterdir()
