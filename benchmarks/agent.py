@@ -40,7 +40,11 @@ Call = Callable[[], np.ndarray]
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row."""
     size = workloads.chosen_size(args)
-    size = dataclasses.replace(size, num_samples=args.num_samples or size.num_samples)
+    size = dataclasses.replace(
+        size,
+        num_samples=args.num_samples or size.num_samples,
+        horizon=args.horizon or size.horizon,
+    )
     planner = workloads.planner(
         size, args.precision, args.optimizer, args.reward, engine=args.engine
     )
@@ -181,6 +185,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--num-samples", type=rows.positive, help="candidates, in place of the size's"
     )
+    parser.add_argument("--horizon", type=rows.positive, help="likewise")
     parser.add_argument(
         "--optimizer", choices=workloads.OPTIMIZERS, default="icem", help="search"
     )
