@@ -22,34 +22,44 @@ def steps_of_a_plan(search):
     return candidates * size.horizon * size.num_particles
 
 
-@pytest.fixture(scope="module")
-def searches():
-    """Thousands of steps, and shares of the full search `[4]`, of each search."""
-    steps, returns = {}, {}
+def logged(run):
+    """The searches and the returns `[4]` of each search with the models of a run."""
+    searches, returns = {}, {}
     with tarfile.open(RESULTS / "search.tar.xz") as logs:
         for member in logs:
-            found = re.fullmatch(r"best/zero-shot-060-(.*)/(.*)\..*", member.name)
+            found = re.fullmatch(rf"{run}/zero-shot-060-(.*)/(.*)\..*", member.name)
             if found is None or found[2] not in ("config", "metrics"):
                 continue
             file = logs.extractfile(member)
             assert file is not None
             if found[2] == "config":
-                search = json.load(file)["task_planner"]
-                steps[found[1]] = steps_of_a_plan(search) / 1000
+                searches[found[1]] = json.load(file)["task_planner"]
                 continue
             rows = [json.loads(line) for line in file]
             assert len({(x["task"], x["seed"], x["trial"]) for x in rows}) == 40
             returns[found[1]] = np.array(
                 [np.mean([x["return"] for x in rows if x["task"] == y]) for y in TASKS]
             )
+    return searches, returns
+
+
+@pytest.fixture(scope="module")
+def searches():
+    """Thousands of steps, and shares of the full search `[4]`, of each search."""
+    found, returns = logged("best")
+    steps = {x: steps_of_a_plan(search) / 1000 for x, search in found.items()}
     full = returns["500-icem-5-20"]
     assert np.array_equal(full.round(), [6787, 5478, 11283, 9038])
     return {x: (steps[x], 100 * returns[x] / full) for x in returns}
 
 
-def cell(steps, shares):
+def shown_as(shares):
     text = " ".join(f"{x:.0f}" for x in shares)
-    return f"{steps:,.0f}: {text}, **{shares.mean():.0f}**"
+    return f"{text}, **{shares.mean():.0f}**"
+
+
+def cell(steps, shares):
+    return f"{steps:,.0f}: {shown_as(shares)}"
 
 
 def test_every_search_is_in_the_table(searches):
@@ -88,3 +98,39 @@ def test_the_smallest_search_that_is_good_enough(searches):
             if "-cem-" in name or "mppi" in name
         )
         assert [x.split(" (")[0] for x in line.split(" | ")] == [*expected, "none"]
+
+
+def test_every_search_of_a_millisecond_is_in_the_text():
+    page = (RESULTS / "README.md").read_text()
+    (text,) = re.findall(r"### Searches of a millisecond\n(.*?)\n#", page, re.DOTALL)
+    found, returns = logged("real-time/100-101-102-103-104")
+    full = returns.pop("full")
+    assert np.array_equal(full.round(), [6326, 6046, 9594, 9055])
+    assert len(returns) == len(re.findall(r"\*\*\d+\*\*", text)) == 22
+    columns = {500: 1, 1000: 2, 1600: 3}
+    for name, search in found.items():
+        if name == "full":
+            continue
+        share = shown_as(100 * returns[name] / full)
+        if not search["means"]:
+            assert share in text
+            continue
+        column = columns[search["num_samples"]]
+        rows = [x.split("|") for x in text.splitlines() if x.count("|") == 5]
+        assert share in [row[column + 1].strip() for row in rows], name
+
+
+def test_the_searches_that_were_chosen_for_a_millisecond():
+    page = (RESULTS / "README.md").read_text()
+    assert "94 ± 3, 97 ± 2, 98 ± 4 and 99 ± 2" in page
+    assert "97 ±\n  9, 100 ± 3, 98 ± 5 and 99 ± 4" in page
+    for name, expected in (
+        ("means-1000-3-12", [94, 97, 98, 99]),
+        ("means-1600-3-12", [97, 100, 98, 99]),
+    ):
+        total = {"full": 0.0, name: 0.0}
+        for seeds in ("100-101-102-103-104", "105-106-107-108-109"):
+            _, returns = logged(f"real-time/{seeds}")
+            total = {x: total[x] + returns[x] for x in total}
+        shares = 100 * total[name] / total["full"]
+        assert np.array_equal(shares.round(), expected)
