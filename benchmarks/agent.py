@@ -50,7 +50,13 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     )
     if args.means:
         planner = models.by_means(planner)
-    turns = timing.in_turn(*calls(size, planner, args.reward), repeats=args.repeats)
+    # `act` returns before its program has ended, whose rest is not the next call's.
+    nothing = jax.jit(lambda: jax.numpy.zeros(()))
+    turns = timing.in_turn(
+        *calls(size, planner, args.reward),
+        repeats=args.repeats,
+        between=lambda: nothing().block_until_ready(),
+    )
     acts, plans, copied = 1e3 * np.asarray(turns).T
     yield rows.make_row(
         "agent",
@@ -129,7 +135,7 @@ def calls(
 
 def policy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row of a policy of HalfCheetah's tasks, at the width of its config."""
-    size = policies.DistillConfig().hidden_size
+    size = 8 if args.tiny else policies.DistillConfig().hidden_size
     onnx, own = (timing.repeat(x, repeats=args.repeats) for x in policy_calls(size))
     yield rows.make_row(
         "agent policy",
@@ -201,6 +207,10 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--policy", action="store_true", help="a policy, not a plan")
     args = parser.parse_args(argv)
     if args.policy:
+        plans = vars(args).keys() - {"policy", "json", "repeats", "tiny"}
+        if others := [x for x in plans if getattr(args, x) != parser.get_default(x)]:
+            flags = ", ".join(f"--{x.replace('_', '-')}" for x in sorted(others))
+            parser.error(f"--policy has no plan that could have {flags}")
         return rows.report(policy(args), OF_POLICY, args.json)
     return rows.report(run(args), COLUMNS, args.json)
 

@@ -2,6 +2,7 @@
 
 import argparse
 import datetime
+import functools
 import importlib.metadata
 import json
 import os
@@ -83,8 +84,13 @@ def positive(text: str) -> int:
     return number
 
 
+@functools.cache
 def _commit() -> str | None:
-    """Returns which code this is, where it is a checkout."""
+    """Returns which code this is, where it is a checkout.
+
+    It is asked once: rows that are appended to a committed file change the checkout,
+    and those of one process must name one commit.
+    """
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     folder = Path(__file__).parent
     try:

@@ -93,9 +93,7 @@ def _work(
     )
     sizes = {"obs_size": shape.obs_size, "action_size": shape.action_size}
     model = jaxpets.ensemble(config, jaxpets.delta_space(), **sizes)
-    rollout = jaxpets.fused_rollout(model, num_particles=shape.num_particles, arch=arch)
-    if not rollout.uses_kernel:
-        raise SystemExit(f"no kernel to time: {rollout.reason}")
+    rollout = workloads.kernel_of(model, precision, shape.num_particles, arch)
     first, second, key = jax.random.split(jax.random.key(0), 3)
     actions = jax.random.uniform(
         second, (shape.num_samples, shape.horizon, shape.action_size), minval=-1.0

@@ -65,17 +65,31 @@ def measure(function: Callable[..., Any], *args: Any, repeats: int) -> Timing:
 
 
 def in_turn(
-    *calls: Callable[[], Any], repeats: int, warm_ups: int = 1
+    *calls: Callable[[], Any],
+    repeats: int,
+    warm_ups: int = 1,
+    between: Callable[[], Any] = lambda: None,
 ) -> list[tuple[float, ...]]:
     """Runs callables in turn, so that all see the same state of the machine.
 
+    Args:
+      calls: what is timed.
+      repeats: how often each is.
+      warm_ups: runs of each before, which do not count.
+      between: is called before each run and not timed.
+
     Returns:
-      The seconds of each, `repeats` times, after runs of each that do not count.
+      The seconds of each, `repeats` times.
     """
+
+    def timed(call: Callable[[], Any]) -> float:
+        between()
+        return seconds(call)
+
     for call in calls:
         for _ in range(warm_ups):
-            seconds(call)
-    return [tuple(seconds(call) for call in calls) for _ in range(repeats)]
+            timed(call)
+    return [tuple(timed(call) for call in calls) for _ in range(repeats)]
 
 
 def compare(

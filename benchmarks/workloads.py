@@ -110,24 +110,29 @@ def model(size: Size, precision: str) -> jaxpets.Ensemble:
 def rollout_fn(
     size: Size, precision: str, engine: str = "scan"
 ) -> jaxpets.typing.RolloutFn:
-    """Returns the particle rollout of the ensemble.
-
-    Raises:
-      SystemExit: if there can be no kernel: a scan must not be timed in its name, nor
-        float32 in the name of another precision.
-    """
+    """Returns the particle rollout of the ensemble; raises what `kernel_of` does."""
     if engine == "scan":
         return jaxpets.particle_rollout(
             model(size, precision).sample,
             num_members=size.num_members,
             num_particles=size.num_particles,
         )
+    arch = "sm_90" if engine == "sm_90" else None
+    return kernel_of(model(size, precision), precision, size.num_particles, arch)
+
+
+def kernel_of(
+    model: jaxpets.Ensemble, precision: str, num_particles: int, arch: str | None
+) -> jaxpets.typing.FusedRollout:
+    """Returns the particle rollout of an ensemble as a kernel.
+
+    Raises:
+      SystemExit: if there can be none: a scan must not be timed in its name, nor
+        float32 in the name of another precision.
+    """
     if jax.default_backend() == "cpu" and precision != "f32":
         raise SystemExit("no kernel to time: that of a CPU is --precision f32 only")
-    arch = "sm_90" if engine == "sm_90" else None
-    fused = jaxpets.fused_rollout(
-        model(size, precision), num_particles=size.num_particles, arch=arch
-    )
+    fused = jaxpets.fused_rollout(model, num_particles=num_particles, arch=arch)
     if not fused.uses_kernel:
         raise SystemExit(f"no kernel to time: {fused.reason}")
     return fused

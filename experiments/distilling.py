@@ -171,7 +171,6 @@ def _explored(now: _Run, source: Source) -> State:
 def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     """Returns the networks `[S]` of the policies."""
     settings = now.config.distill
-    begin = time.monotonic()
     place = functools.partial(devices.place, now.placement)
     seeds, *trials, length, _ = planned.transitions.obs.shape
     more = max(settings.num_rounds - 1, 0) * len(now.tasks.names)
@@ -179,35 +178,36 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     dataset = place(seen.room(now.parts, state, seeds, count * length), SEED)
     params = jaxpets.PlanParams(place(state.params, SEED), now.tasks.params)
     append = _program(now, seen.append, (_SEEDS, _SEEDS), _SEEDS)
-    init = _program(now, now.distiller.init, (_KNOWN, _SEEDS, _SEEDS), _SEEDS)
-    learn = _program(
-        now, now.distiller.step, (_KNOWN, _SEEDS, _SEEDS, _SEEDS), (_SEEDS, _SEEDS),
-        donate_argnums=2,
-    )  # fmt: skip
     dataset = append(dataset, place(planned.transitions, SEED))
     # With the keys of places that no task has: those of tasks are for trials.
     apart = [len(now.parts.robot.tasks.names)]
-    learned = init(params, place(now.keys(0, apart)[..., 0], SEED), dataset)
+    own = None
     if settings.critic.num_updates:
         keys = place(now.keys(0, [apart[0] + 1])[..., 0], SEED)
         own = imagined_policy.learned(
             now.config, now.parts, now.tasks, now.placement, params, keys, dataset,
             now.folder,
         )  # fmt: skip
-        own = place(own, SEED)
-        if settings.num_rounds:  # the planner's values are others than its critics'
-            own = learned.params._replace(actor=own.actor, mean=own.mean, std=own.std)
-        learned = learned._replace(params=own)
+        if not settings.num_rounds:
+            return own
+    begin = time.monotonic()
+    init = _program(now, now.distiller.init, (_KNOWN, _SEEDS, _SEEDS), _SEEDS)
+    learn = _program(
+        now, now.distiller.step, (_KNOWN, _SEEDS, _SEEDS, _SEEDS), (_SEEDS, _SEEDS),
+        donate_argnums=2,
+    )  # fmt: skip
+    learned = init(params, place(now.keys(0, apart)[..., 0], SEED), dataset)
+    if own is not None:  # without its critics: the planner's values are others
+        begun = {x: place(getattr(own, x), SEED) for x in ("actor", "mean", "std")}
+        learned = learned._replace(params=learned.params._replace(**begun))
     for turn in range(1, settings.num_rounds + 1):
         keys = now.keys(turn, apart)[..., 0]
         learned, metrics = learn(params, place(keys, SEED), learned, dataset)
         metrics = devices.collect(now.placement, jax.block_until_ready(metrics), SEED)
-        error, skipped = (
-            float(np.mean(x)) for x in (metrics.error, metrics.num_skipped)
-        )
+        error, skipped = np.mean(metrics.error), np.sum(metrics.num_skipped)
         text = f"distill {turn}/{settings.num_rounds}  off the planner by {error:.3f}"
         if skipped:
-            text = f"{text}  {skipped:.0f} gradient steps were not finite: left out"
+            text = f"{text}  {skipped:,} gradient steps were not finite: left out"
         if turn < settings.num_rounds:
             networks = devices.collect(now.placement, learned.params, SEED)
             state = state._replace(reward=networks)
@@ -217,8 +217,7 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
         now.progress.line(f"{text}  {time.monotonic() - begin:.1f} s")
     seconds = time.monotonic() - begin
     plans = settings.num_rounds * settings.horizon * settings.num_trials
-    if plans:
-        now.folder.say(f"distilled {plans:,} plans of each seed  {seconds:.1f} s")
+    now.folder.say(f"distilled {plans:,} plans of each seed  {seconds:.1f} s")
     return devices.collect(now.placement, learned.params, SEED)
 
 

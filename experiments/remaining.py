@@ -29,6 +29,7 @@ def left(sweep: Sweep, jobs: Sequence[Job]) -> list[Job]:
 def _complete(folder: Path, commands: Sequence[Sequence[str]]) -> bool:
     explored = cli.parse(commands[0])
     whole = _is_complete(folder, explored, explored.num_trials)
+    trials = read(folder).trial or 0 if whole else 0
     folders: set[str] = set()
     for command in commands[1:]:
         try:
@@ -36,6 +37,12 @@ def _complete(folder: Path, commands: Sequence[Sequence[str]]) -> bool:
         except CheckpointError:  # nothing is explored yet
             config, is_explored = cli.parse(command, explored), False
         step = explored.num_trials if config.at_trial is None else config.at_trial
+        if config.at_trial is None and trials > step:
+            raise UsageError(
+                f"num-trials is {step}, but {folder} has explored {trials}, after "
+                f"which phase 2 would begin. Say at-trial = {step} in then, or choose "
+                "another out."
+            )
         name = cli.variant(config, step)
         if name in folders:
             raise UsageError(
@@ -57,4 +64,4 @@ def _is_complete(folder: Path, config: Config, trial: int | None) -> bool:
         found = read(folder)
     except CheckpointError:  # torn, where a disk was full: the run writes it anew
         return False
-    return found.state == COMPLETE and trial in (None, found.trial)
+    return found.state == COMPLETE and (trial is None or found.trial >= trial)

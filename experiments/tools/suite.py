@@ -78,6 +78,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UsageError(f"--figure {args.figure} is not valid; {valid}.")
         found: Results = {}
         variant = args.explored, args.tag
+        if variant != (None, "") and all(path.is_file() for path in args.runs):
+            flags = "--explored and --tag choose among runs"
+            raise UsageError(f"{flags}; {args.runs[0]} is a file of results.")
         for path, name in zip(args.runs, suffixes(args.runs), strict=True):
             own = read(path) if path.is_file() else results(path, *variant)
             found |= {arm + name: x for arm, x in own.items()}

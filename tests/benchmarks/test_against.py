@@ -51,6 +51,19 @@ def test_a_row_without_the_plain_program_of_its_commit_is_not_compared():
     assert pair.committed == COMMITTED[1] and pair.speed == 1.0
 
 
+@pytest.mark.parametrize(
+    "other",
+    [{"optimizer": "icem"}, {"chunk_size": 25}, {"horizon": 5}, {"hidden_sizes": [8]}],
+)
+def test_another_plan_of_the_same_size_is_no_unit(other):
+    found = plain(1.0)
+    found["sizes"] |= other
+    pairs = list(
+        against.pairs([plain(10.0), found, row(2.0, "fit", seeds=1)], COMMITTED)
+    )
+    assert pairs[-1].speed == 1.0
+
+
 def test_c_mujoco_is_measured_by_the_plain_loop_of_its_host():
     """Which is timed after it."""
 

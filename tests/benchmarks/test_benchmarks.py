@@ -167,7 +167,7 @@ def test_agent(tmp_path):
 
 def test_agent_adds_the_median_of_the_differences_of_pairs(monkeypatch):
     seconds = [(5e-3, 1e-3, 2e-3), (3e-3, 2e-3, 2e-3), (4e-3, 3e-3, 8e-3)]
-    monkeypatch.setattr(agent.timing, "in_turn", lambda *calls, repeats: seconds)
+    monkeypatch.setattr(agent.timing, "in_turn", lambda *calls, **options: seconds)
     (row,) = agent.main(["--tiny", "--engine", "scan", "--repeats", "3"])
     assert row["added_ms"] == pytest.approx(1)  # and not 4 - 2
     assert (row["act_ms"], row["plan_ms"]) == pytest.approx((4, 2))
@@ -193,9 +193,18 @@ def test_agent_with_a_policy(tmp_path):
     pytest.importorskip("onnxruntime")
     path = tmp_path / "rows.jsonl"
     (row,) = agent.main(["--policy", "--repeats", "3", "--json", str(path)])
+    assert row["sizes"] == {"hidden_size": 256}
     assert json.loads(path.read_text()) == json.loads(json.dumps(row))
     assert 0 < row["onnx_min_us"] <= row["onnx_us"]
     assert 0 < row["jax_min_us"] <= row["jax_us"]
+    (tiny,) = agent.main(["--policy", "--tiny", "--repeats", "3"])
+    assert tiny["sizes"]["hidden_size"] < 256
+
+
+def test_agent_with_a_policy_has_no_plan(capsys):
+    with pytest.raises(SystemExit):
+        agent.main(["--policy", "--means", "--num-samples", "3"])
+    assert "no plan that could have --means, --num-samples" in capsys.readouterr().err
 
 
 def test_rollout_and_fit(tmp_path):
@@ -306,6 +315,18 @@ def test_what_is_slower_once_is_timed_once_more(second, fails):
     assert ran == [all_benchmarks.UNIT, (plan, "both")]
     same = all_benchmarks.Outcome(day(1.0, 1.0), commands, [])
     assert all_benchmarks.slower(same, day(1.0, 1.0), again) == [] and len(ran) == 2
+
+
+def test_rows_of_a_process_name_one_commit(monkeypatch):
+    """Though the first is appended to a file that is committed."""
+    said = iter(["a\n", "a-dirty\n"])
+    monkeypatch.setattr(
+        rows_module.subprocess, "check_output", lambda *a, **b: next(said)
+    )
+    rows_module._commit.cache_clear()
+    found = [rows_module.make_row("plan", {})["git"] for _ in range(2)]
+    rows_module._commit.cache_clear()
+    assert found == ["a", "a"]
 
 
 def test_a_row_is_on_disk_before_the_next_is_measured(tmp_path):
@@ -433,5 +454,7 @@ def test_on_a_cpu_the_kernel_is_timed_but_not_traced():
     np.testing.assert_allclose(jax.jit(rollout)(*args), want, rtol=1e-5, atol=1e-5)
     with pytest.raises(SystemExit, match="that of a CPU is --precision f32 only"):
         plan.main(["--tiny", "--seeds", "1", "--engine", "kernel"])
+    with pytest.raises(SystemExit, match="that of a CPU is --precision f32 only"):
+        shapes.main(["--tiny", "--shape", "paper"])
     with pytest.raises(SystemExit, match="there is no GPU whose programs"):
         trace.main(["--tiny", "--seeds", "1"])

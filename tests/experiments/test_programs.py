@@ -50,6 +50,18 @@ def test_nothing_is_kept_where_others_write(folder):
     assert jax.config.jax_compilation_cache_dir == str(folder)
 
 
+def test_nothing_is_kept_where_others_could_put_a_folder_in_its_place(folder):
+    folder.mkdir(parents=True)
+    folder.parent.chmod(0o777)
+    programs.keep()
+    assert jax.config.jax_compilation_cache_dir is None
+    folder.parent.chmod(0o700)
+    folder.rename(folder.parent / "elsewhere")
+    folder.symlink_to(folder.parent / "elsewhere")
+    programs.keep()
+    assert jax.config.jax_compilation_cache_dir is None
+
+
 def test_folders_are_private_whatever_the_umask_is(folder):
     """Kernels are kept in the one above, if nobody else may write there."""
     before = os.umask(0o002)

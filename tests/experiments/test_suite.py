@@ -279,6 +279,14 @@ def test_a_figure_is_of_the_file_of_results(tmp_path, peers):
     assert all(f"<!-- {name} -->" in said for name in suite.NAMES)
 
 
+@pytest.mark.parametrize("flags", [("--tag", "actor"), ("--explored", "3")])
+def test_no_variant_is_asked_of_a_file_of_results(tmp_path, peers, capsys, flags):
+    path = tmp_path / "results.json"
+    path.write_text("{}")
+    assert suite.main([str(path), "--peers", peers, *flags]) == 2
+    assert f"{path} is a file of results" in capsys.readouterr().err
+
+
 def test_a_file_that_has_no_results_is_refused(tmp_path, peers, capsys):
     path = tmp_path / "results.json"
     path.write_text('{"best": 3}')

@@ -336,7 +336,8 @@ refit.batch-size = 16
     [
         ("", "", "complete"),
         ("smoke", "smoke", "complete"),
-        ("[[then]]", "num-trials = 2\n[[then]]", "left"),
+        ("[[then]]", "num-trials = 4\n[[then]]", "left"),
+        ("[[then]]", "num-trials = 2\n[[then]]\nat-trial = 2", "left"),
         ("[[then]]", "training.batch-size = 9\n[[then]]", "left"),
         ("num-epochs = 1", "num-epochs = 2", "left"),
         ("[[then]]", '[[then]]\nphase = "zero-shot"\ntag = "more"\n[[then]]', "left"),
@@ -351,6 +352,19 @@ def test_a_run_is_complete_if_it_is_what_the_file_says(
     (tmp_path / "copy" / performed_once.name).rename(tmp_path / "runs" / "epistemic")
     assert sweep.main([str(file(DONE.replace(old, new, 1))), "--list"]) == 0
     assert f"epistemic  {state}" in capsys.readouterr().out
+
+
+def test_phase_2_of_fewer_trials_than_were_explored_is_refused(
+    performed_once, file, tmp_path, capsys
+):
+    runs.copied(performed_once, tmp_path / "copy")
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "copy" / performed_once.name).rename(tmp_path / "runs" / "epistemic")
+    text = DONE.replace("[[then]]", "num-trials = 2\n[[then]]")
+    assert sweep.main([str(file(text)), "--list"]) == 2
+    said = capsys.readouterr().err
+    assert "num-trials is 2, but" in said and "has explored 3" in said
+    assert "at-trial = 2" in said
 
 
 def test_a_run_whose_status_is_torn_is_left(performed_once, file, tmp_path, capsys):
