@@ -48,6 +48,20 @@ class Networks(NamedTuple):
     value_fn: Callable[[Guided, Array], Array]
 
 
+def layers_of(params: ActorCriticParams) -> Any:
+    """Returns the layers of an actor by Flax's names; raises TypeError for another."""
+    check_record("params", params, ActorCriticParams)
+    try:
+        layers: Any = params.actor["params"]
+        _ = layers["Dense_0"]["kernel"], layers["Dense_2"]["bias"]
+    except (TypeError, KeyError) as error:
+        kind = type(params.actor).__name__
+        raise TypeError(
+            f"params.actor must be parameters of an actor, got {kind}."
+        ) from error
+    return layers
+
+
 def build_networks(
     hidden_size: int, space: ModelSpace, goals: Goals, box: ActionBox
 ) -> Networks:

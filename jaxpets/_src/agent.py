@@ -65,8 +65,7 @@ def agent(
       random_planner: acts before the model has learned anything.
       capacity: C, transitions kept; the oldest are replaced.
       reward_data: keeps the data of the exploration reward in step with the model.
-      params: what the model has learned before, as from `load_model`; the agent then
-        plans from the first step.
+      params: what the model learned before, as from `load_model`; it plans at once.
       num_envs: N worlds that are stepped together, as a vectorised environment of
         Gymnasium; None for one, without a leading axis.
       autoreset: who begins the next trial of a world, in the words of Gymnasium's
@@ -167,8 +166,9 @@ class Agent:
         Raises:
           TypeError: if planner is none, or reward holds what is no number.
         """
-        check_record("planner", planner or self._planner, Planner)
-        self._task = (planner or self._planner, computed.strongly_typed(reward))
+        chosen = self._planner if planner is None else planner
+        check_record("planner", chosen, Planner)
+        self._task = (chosen, computed.strongly_typed(reward))
 
     def act(self, obs: Any) -> np.ndarray:
         """Returns the next action, `[A]` or `[N, A]` float32.

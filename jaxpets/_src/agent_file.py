@@ -1,13 +1,14 @@
 """What an agent has learned and seen, as one file."""
 
 import os
+from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpets._src import tensor_file
+from jaxpets._src import file_facts, tensor_file
 from jaxpets._src.learner import LearnerState
 
 _FORMAT = {"format": "jaxpets agent", "version": "1"}
@@ -47,7 +48,8 @@ def read(
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: naming what is not there, or does not fit.
+      ValueError: naming what is not there, does not fit, or is no number of a model or
+        of its data.
     """
     file = tensor_file.read(path)
     counts = _counts(file)
@@ -62,9 +64,29 @@ def read(
                 f"{got}."
             )
     arrays = file.arrays()
+    _check_numbers(file, arrays)
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     structure = cast(Any, jax.tree.structure(template))
     return cast(LearnerState, jax.tree.unflatten(structure, leaves)), counts
+
+
+def _check_numbers(
+    file: tensor_file.TensorFile, arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Raises for a model that computes nothing, or data that are not where it says."""
+    model = {
+        name.removeprefix("params."): array
+        for name, array in arrays.items()
+        if name.startswith("params.")
+    }
+    file_facts.check_numbers(f"params in {file.path}", model)
+    capacity = len(arrays["dataset.data.obs"])
+    for name, most in (("size", capacity), ("cursor", capacity - 1)):
+        got = int(arrays[f"dataset.{name}"])
+        if not 0 <= got <= most:
+            raise ValueError(
+                f"dataset.{name} in {file.path} must be 0 to {most}, got {got}."
+            )
 
 
 def _counts(file: tensor_file.TensorFile) -> Counts:

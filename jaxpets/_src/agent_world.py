@@ -129,9 +129,11 @@ def last_obs(
         )
     if world.num_envs is None:
         return numbers(world, "info['final_obs']", found)
-    if len(found) != world.num_envs:
+    count = len(found) if hasattr(found, "__len__") else None
+    if count != world.num_envs:
         raise ValueError(
-            f"info['final_obs'] must have {world.num_envs} rows, got {len(found)}."
+            f"info['final_obs'] must have {world.num_envs} rows, got "
+            f"{type(found).__name__ if count is None else count}."
         )
     rows = [found[i] if ended else reached[i] for i, ended in enumerate(done)]
     return numbers(world, "info['final_obs']", rows)

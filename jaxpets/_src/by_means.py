@@ -21,6 +21,7 @@ def by_means(planner: Planner) -> Planner:
     check_record("planner", planner, Planner)
 
     def step(params: PlanParams, *now: Any) -> Any:
+        check_record("params", params, PlanParams)
         quiet = without_noise(params.dynamics)
         return planner.step(params._replace(dynamics=quiet), *now)
 

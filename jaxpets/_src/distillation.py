@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_key, check_record
+from jaxpets._src.guards import choose, guarded_step
 from jaxpets._src.moments import counted, moments
 from jaxpets._src.optimizer import Optimizer, check_optimizer
 from jaxpets._src.types import Dataset, RewardFn
@@ -118,7 +119,7 @@ def random_network_distillation(
         check_array("dataset.data.next_obs", rows, ["C", obs_size])
         used = counted(rows, dataset.size)
         mean, std = moments(rows, dataset.size)
-        state = state._replace(mean=mean, std=std)
+        before, state = state, state._replace(mean=mean, std=std)
         inputs = jnp.where(used[:, None], _whiten(state, rows), 0.0)
         weight = used.astype(jnp.float32)
         num_batches = (dataset.size + batch_size - 1) // batch_size
@@ -130,12 +131,10 @@ def random_network_distillation(
             counts = jnp.take(weight, batch, mode="fill", fill_value=0.0)
             grad_fn = cast(Callable[..., Any], jax.grad(_loss))
             grads = grad_fn(predictor, state.target, shown, counts)
-            # Optimizers of optax do not trace under strict promotion.
-            with jax.numpy_dtype_promotion("standard"):
-                updates, opt_state = optimizer.update(
-                    grads, opt_state, cast(Any, predictor)
-                )
-            return jax.tree.map(jnp.add, predictor, updates), opt_state
+            predictor, opt_state, _ = guarded_step(
+                optimizer.update, grads, predictor, opt_state
+            )
+            return predictor, opt_state
 
         start = (state.predictor, state.opt_state)
         predictor, opt_state = cast(
@@ -143,11 +142,13 @@ def random_network_distillation(
             jax.lax.fori_loop(0, num_epochs * num_batches, update, start),
         )
         scale = _loss(predictor, state.target, inputs, weight)
-        return state._replace(
+        trained = state._replace(
             predictor=predictor,
             opt_state=opt_state,
             scale=jnp.where(scale > 0.0, scale, 1.0),
         )
+        # Weights may be finite, and so large that what they predict is not.
+        return choose(jnp.isfinite(scale), trained, before)
 
     def reward(
         params: DistillationState, obs: Array, action: Array, next_obs: Array

@@ -117,7 +117,7 @@ def icem(
     num_kept = round(kept_fraction * num_elites)
     smallest = min(num_samples, 2 * num_elites)
     populations = [
-        max(int(num_samples / decay**i), smallest) for i in range(num_iterations)
+        max(x, smallest) for x in _populations(num_samples, decay, num_iterations)
     ]
 
     def init() -> ICEMState:
@@ -203,6 +203,13 @@ def icem(
         return Solution(best, found.value, tried), state
 
     return TrajectoryOptimizer(init, step)
+
+
+def _populations(num_samples: int, decay: float, num_iterations: int) -> list[int]:
+    """Returns how many samples each iteration would have, were none too few."""
+    with np.errstate(over="ignore"):  # of a large decay nothing is left
+        shares = np.float64(decay) ** np.arange(num_iterations)
+    return [int(num_samples / share) for share in shares]
 
 
 def _numbers(

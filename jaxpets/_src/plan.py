@@ -134,6 +134,7 @@ def plan(
                 finite, jnp.clip(value, WORST_VALUE, -WORST_VALUE), WORST_VALUE
             )
 
+        whole = objective if chunk_size is None else chunked(objective, chunk_size)
         if propose_fn is not None:
             # The search does so, too, but its mean is needed before.
             check_record("state", state, wanted.__class__)
@@ -142,9 +143,8 @@ def plan(
             proposal = propose_fn(params, propose_key, obs)
             check_array("propose_fn's result", proposal, wanted.mean.shape)
             both = jnp.stack([state.mean, proposal])
-            last, new = objective(value_key, both)
+            last, new = whole(value_key, both)
             state = state._replace(mean=jnp.where(new > last, proposal, state.mean))
-        whole = objective if chunk_size is None else chunked(objective, chunk_size)
         solution, state = optimizer.step(whole, key, state)
         return PlanOutput(solution.actions[0], *solution), state
 

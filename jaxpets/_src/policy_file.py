@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 
 from jaxpets._src import dataset, file_facts, tensor_file
 from jaxpets._src.action_box import ActionBox, action_box
-from jaxpets._src.actor_critic_networks import Networks, build_networks
+from jaxpets._src.actor_critic_networks import Networks, build_networks, layers_of
 from jaxpets._src.actor_critic_records import ActorCriticParams, Goals
 from jaxpets._src.check_space import check_space_size
 from jaxpets._src.checks import check_count, check_like, check_record
@@ -49,10 +49,9 @@ def save_policy(
       TypeError, ValueError: if an argument is not what it should be, or has NaN, or
         space has another size than obs_size.
     """
-    check_record("params", params, ActorCriticParams)
+    kernel = layers_of(params)["Dense_0"]["kernel"]  # [F + G, hidden]
     check_space_size(space, obs_size)
     box = action_box(action_low, action_high)
-    kernel = params.actor["params"]["Dense_0"]["kernel"]  # [F + G, hidden]
     networks = build_networks(kernel.shape[-1], space, _NO_GOALS, box)
     template = _template(networks, space, obs_size, box, kernel.shape[0])
     check_like("params", params, template)

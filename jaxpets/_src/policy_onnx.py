@@ -7,10 +7,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxpets._src.action_box import action_box
-from jaxpets._src.actor_critic_networks import CLIP
+from jaxpets._src.actor_critic_networks import CLIP, layers_of
 from jaxpets._src.actor_critic_records import ActorCriticParams
 from jaxpets._src.check_space import check_space_size
-from jaxpets._src.checks import check_array, check_record
+from jaxpets._src.checks import check_array
 from jaxpets._src.ensemble import delta_space
 from jaxpets._src.network import NORM_EPSILON
 from jaxpets._src.types import Coordinate, ModelSpace
@@ -64,7 +64,7 @@ def to_onnx(
         of the space are functions of your own.
       ImportError: without the package onnx.
     """
-    check_record("params", params, ActorCriticParams)
+    layers = layers_of(params)
     check_space_size(space, obs_size)
     box = action_box(action_low, action_high)
     read = _read(space, obs_size)
@@ -75,7 +75,6 @@ def to_onnx(
             f"space must have at most the {mean.shape[0]} features that the policy "
             f"reads, got {read.offset.shape[0]} of obs_size {obs_size}."
         )
-    layers: Any = params.actor["params"]
     bias = layers["Dense_2"]["bias"]
     check_array("the last bias of params.actor", bias, [box.center.shape[0]])
     graph = _Graph()

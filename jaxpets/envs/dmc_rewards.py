@@ -15,7 +15,7 @@ from jax import Array
 from jaxpets._src.types import RewardFn
 from jaxpets.envs.mujoco_robot import Entry
 from jaxpets.envs.recipe import Rewards
-from jaxpets.envs.tolerance import linear, quadratic, tolerance
+from jaxpets.envs.tolerance import holds, linear, quadratic, tolerance
 
 _SPIN_RATE = 10.0  # rad/s, of a flip; ours
 _TORSO_SPEED = "sensordata/torso_subtreelinvel.x"
@@ -102,11 +102,12 @@ def ball_in_cup(model: Any, entry: Entry) -> Rewards:
     room = model.site("target").size - model.geom("ball").size[0]
 
     def catch(obs: Array) -> Array:
-        inside = [
-            jnp.abs(obs[..., c] - obs[..., b] + float(target[i])) < float(room[i])
+        away = [
+            jnp.abs(obs[..., c] - obs[..., b] + float(target[i]))
             for (i, _), c, b in zip(axes, cup, ball, strict=True)
         ]
-        return (inside[0] & inside[1]).astype(jnp.float32)
+        inside = [x < float(room[i]) for (i, _), x in zip(axes, away, strict=True)]
+        return holds(inside[0] & inside[1], away[0] + away[1])
 
     return {"catch": _of_state(catch)}
 

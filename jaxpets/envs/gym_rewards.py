@@ -13,6 +13,7 @@ from jax import Array
 from jaxpets._src.types import RewardFn
 from jaxpets.envs.mujoco_robot import Entry
 from jaxpets.envs.recipe import Rewards
+from jaxpets.envs.tolerance import holds
 
 # `(observations) -> what a step earns besides`.
 HealthFn = Callable[[Array], Array]
@@ -98,7 +99,8 @@ def inverted_pendulum(model: Any, entry: Entry) -> Rewards:
 
     def balance(constants: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         del constants, obs, action
-        return (jnp.abs(next_obs[..., hinge]) <= 0.2).astype(jnp.float32)
+        angle = next_obs[..., hinge]
+        return holds(jnp.abs(angle) <= 0.2, angle)
 
     return {"balance": balance}
 

@@ -67,8 +67,8 @@ class Robot(NamedTuple):
       axes: two quantities by which exploration is shown, or none.
       angle: the entry, unwrapped and in rad, of which net turns are counted, if any.
       model: the compiled MuJoCo model to draw it with, or None.
-      qpos_fn: `(obs [T, D]) -> [T, Q]`, positions of a recorded trial to draw, NaN
-        where they are not observed; or None.
+      qpos_fn: `(obs [T, D]) -> [T, Q]`, positions of a recorded trial to draw;
+        where they are not observed those of the model at rest, or NaN; or None.
       camera: of the model, to draw it by; None for one that suits it.
       task_reset: `(a row of tasks.params, key) -> EnvState`, where trials of a task
         start; None if all of them start as `env.reset` does.

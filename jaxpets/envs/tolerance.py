@@ -25,6 +25,11 @@ def quadratic(distance: Array, value: float) -> Array:
     return jnp.maximum(1.0 - (1.0 - value) * distance**2, 0.0)
 
 
+def holds(condition: Array, x: Array) -> Array:
+    """Returns 1 where a condition on x holds and 0 elsewhere, but NaN where x is."""
+    return jnp.where(jnp.isnan(x), jnp.nan, condition.astype(jnp.float32))
+
+
 def tolerance(
     x: Array,
     low: float = -math.inf,
@@ -48,9 +53,9 @@ def tolerance(
       shape: how it falls: `gaussian`, `linear` or `quadratic`.
 
     Returns:
-      `[...]` in [0, 1].
+      `[...]` in [0, 1]; NaN where x is, so that no plan wins by a state that has none.
     """
     outside = jnp.maximum(jnp.maximum(low - x, x - high), 0.0)
     if not margin:
-        return (outside == 0.0).astype(jnp.float32)
+        return holds(outside == 0.0, outside)
     return shape(outside / margin, value)

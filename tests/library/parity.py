@@ -4,6 +4,7 @@ A judge has `put(physics)`, `step(action)`, `reward(task, constants, action)`, `
 and `repeat`, for how many of its steps ours holds an action.
 """
 
+import operator
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpets import envs
+from jaxpets.envs import with_constants
 
 
 class Rolled(NamedTuple):
@@ -112,3 +114,17 @@ def differences(robot, judge, trials):
     counts = (trials.rewards > 0).sum(axis=(0, 1)).tolist()
     positive = dict(zip(names, counts, strict=True))
     return Differences(num_trials * num_steps, *worst.values(), flipped, positive)
+
+
+def assert_nothing_is_earned_by_nan(robot):
+    """So that `plan` rejects what has diverged in imagination, in every task."""
+    env, tasks = robot.env, robot.tasks
+    constants = env.reset(jax.random.key(0)).constants
+    obs = env.reset(jax.random.key(0)).obs
+    for i, name in enumerate(tasks.names):
+        task = jax.tree.map(operator.itemgetter(i), tasks.params)
+        task = with_constants(task, constants)
+        action = jnp.zeros(env.action_low.shape)
+        assert np.isfinite(tasks.reward_fn(task, obs, action, obs)), name
+        nothing = jnp.full_like(obs, jnp.nan)
+        assert not np.isfinite(tasks.reward_fn(task, obs, action, nothing)), name

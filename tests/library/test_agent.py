@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 import toys
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 import jaxpets
@@ -407,6 +408,39 @@ def test_what_a_world_may_not_say(make, trained):
         two.observe(np.zeros((2, 2)), ended, info=[{"final_obs": at(0)}, {}])
     with pytest.raises(ValueError, match="must have 2 rows, got 1"):
         two.observe(np.zeros((2, 2)), ended, info={"final_obs": [at(0)]})
+    with pytest.raises(ValueError, match="must have 2 rows, got int"):
+        two.observe(np.zeros((2, 2)), ended, info={"final_obs": 5})
+
+
+def test_what_performs_must_be_a_planner(make, trained):
+    agent = make(params=trained)
+    with pytest.raises(TypeError, match="planner must be a Planner, got int"):
+        agent.perform(1.0, 0)
+    agent.perform(1.0)
+    agent.perform(1.0, PULL)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "words"),
+    [
+        ("dataset.size", 10**6, r"dataset.size in .* must be 0 to \d+, got 1000000"),
+        ("dataset.size", -1, "dataset.size in .* got -1"),
+        ("dataset.cursor", 10**6, "dataset.cursor in .* got 1000000"),
+        ("params.scaler.std", 0, "scaler.std of params in .* must be positive"),
+        ("params.scaler.mean", np.nan, "scaler.mean of params in .* no NaN"),
+    ],
+)
+def test_a_strangers_agent_is_refused(make, trained, tmp_path, name, number, words):
+    path = tmp_path / "agent.safetensors"
+    make(params=trained).save(path)
+    arrays = load_file(path)
+    with safe_open(path, "np") as file:
+        metadata = file.metadata()
+    save_file({**arrays, name: np.full_like(arrays[name], number)}, path, metadata)
+    agent = make(params=trained)
+    with pytest.raises(ValueError, match=words):
+        agent.load(path)
+    agent.act(at(0.0))  # as it was
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])

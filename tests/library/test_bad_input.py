@@ -194,6 +194,9 @@ WRONG = {
         lambda: guided_reward(3), "reward_fn must be a function, got 3"),
     "by_means of no planner": (
         lambda: by_means(None), "planner must be a Planner"),
+    "params of no planner in by_means": (
+        lambda: by_means(plan()).step((), KEY, (), OBS),
+        "params must be a PlanParams"),
     "without_noise of no model": (
         lambda: without_noise(None), "params must be an EnsembleParams"),
     "without_noise of a model of another kind": (

@@ -109,6 +109,18 @@ def test_an_imagined_state_that_blew_up_has_no_novelty(untrained):
     assert np.isnan(novelty(untrained, np.float32([[np.inf, 0], [0, np.nan]]))).all()
 
 
+def test_a_step_that_is_not_finite_is_left_out():
+    """As of a rate at which training blows up; it stays usable."""
+    wild = random_network_distillation(
+        optax.sgd(1e4), **SIZES, num_epochs=20, batch_size=8
+    )
+    state = jax.jit(wild.init)(jax.random.key(0))
+    for _ in range(2):
+        state = jax.jit(wild.refresh)(state, (), dataset_of(some_rows(60)))
+    assert np.isfinite(novelty(state, some_rows(2, seed=1))).all()
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.predictor))
+
+
 def test_it_is_reward_data_of_a_learner(untrained):
     """It keeps its shapes, over seeds as well."""
     data = jaxpets.RewardData(RND.init, RND.refresh)

@@ -123,6 +123,11 @@ def test_positions_are_drawn_from_what_was_observed():
     np.testing.assert_array_equal(alone, np.tile(np.eye(9)[2], (3, 1)))
 
 
+@pytest.mark.parametrize("name", DOMAINS)
+def test_a_state_that_is_no_number_earns_none(name):
+    parity.assert_nothing_is_earned_by_nan(make(name))
+
+
 @pytest.mark.parametrize("shape", [gaussian, linear, quadratic])
 def test_tolerance_is_that_of_dm_control(shape):
     x = np.linspace(-4.0, 4.0, 161)

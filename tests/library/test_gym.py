@@ -4,6 +4,7 @@ import functools
 
 import gym_judge
 import numpy as np
+import parity
 import pytest
 
 from jaxpets import envs
@@ -26,6 +27,11 @@ def test_steps_and_rewards_are_those_of_gymnasium(name):
     low, high = robot.model.actuator_ctrlrange.T
     np.testing.assert_allclose(robot.env.action_low, low)
     np.testing.assert_allclose(robot.env.action_high, high)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_state_that_is_no_number_earns_none(name):
+    parity.assert_nothing_is_earned_by_nan(compared(name)[1])
 
 
 def test_trials_start_near_the_models_own_posture():

@@ -119,6 +119,12 @@ def test_population_shrinks_to_twice_the_elites():
     assert sizes == want
 
 
+def test_of_a_steep_decay_twice_the_elites_are_left():
+    optimizer = search(num_iterations=12, decay=1e30, num_samples=60, num_elites=8)
+    sizes = [len(actions) for actions in record(optimizer, bumpy).actions]
+    assert sizes == [64, *[20] * 10, 21]
+
+
 @pytest.mark.parametrize("num_iterations", [1, 5])
 @pytest.mark.parametrize("execute_best", [True, False])
 def test_a_loop_is_the_same_search(num_iterations, execute_best):

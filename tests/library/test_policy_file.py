@@ -96,6 +96,15 @@ def test_numbers_that_are_none_are_not_saved(policy, tmp_path):
     assert not (tmp_path / "p").exists()
 
 
+@pytest.mark.parametrize("actor", [None, {"params": {"Dense_0": {}}}])
+def test_what_is_no_actor_is_neither_saved_nor_written(policy, tmp_path, actor):
+    bad, how = policy[1]._replace(actor=actor), {"obs_size": SIZE, **BOX}
+    with pytest.raises(TypeError, match="actor must be parameters of an actor, got"):
+        policies.save_policy(tmp_path / "p", bad, SPACE, **how)
+    with pytest.raises(TypeError, match="actor must be parameters of an actor, got"):
+        policies.to_onnx(bad, SPACE, **how)
+
+
 def changed(saved, path, drop=(), **changes):
     """Writes a file that is like the saved one but for some of its parts."""
     with safe_open(saved, "np") as file:

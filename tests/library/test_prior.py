@@ -76,6 +76,25 @@ def test_a_search_begins_at_the_better_of_two(name, better):
     assert asked == [(2,)]
 
 
+def test_a_proposal_is_compared_in_chunks_too():
+    sizes = []
+
+    def rollout(params, key, obs, actions):
+        sizes.append(len(actions))
+        return ROLLOUT(params, key, obs, actions)
+
+    def propose(params, key, obs):
+        return jnp.zeros((HORIZON, 1), jnp.float32)
+
+    search = toys.optimizer("cem", horizon=HORIZON)
+    params = PlanParams(GAIN, jnp.float32(5.0))
+    planner = jaxpets.plan(
+        rollout, toys.reach, search, propose_fn=propose, chunk_size=1
+    )
+    jax.eval_shape(planner.step, params, jax.random.key(0), search.init(), FAR)
+    assert set(sizes) == {1}
+
+
 def test_what_is_not_finite_is_no_beginning():
     def propose(params, key, obs):
         return jnp.full((HORIZON, 1), jnp.nan, jnp.float32)
