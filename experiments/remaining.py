@@ -64,4 +64,4 @@ def _is_complete(folder: Path, config: Config, trial: int | None) -> bool:
         found = read(folder)
     except CheckpointError:  # torn, where a disk was full: the run writes it anew
         return False
-    return found.state == COMPLETE and (trial is None or found.trial >= trial)
+    return found.state == COMPLETE and (trial is None or (found.trial or 0) >= trial)

@@ -97,7 +97,8 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
             from . import phases
 
             phases.explore(config, run, watch)
-        run.say(f"next: {calling.line('run', 'zero-shot', '--from', run.path)}")
+        named = ["--from", str(run.path), *user_files.flags(config.env, config.arm)]
+        run.say(f"next: {calling.line('run', 'zero-shot', *named)}")
         return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / cli.variant(config, step)

@@ -78,8 +78,7 @@ def _phases(config: Config, arguments: Sequence[str], watch: "_Whole") -> int:
 def _source(config: Config) -> list[str]:
     """Returns the flags of phase 2 that name the run, and the user's files in it."""
     named = ["--from", str(config.out / cli.explored_run(config).name)]
-    named += ["--env", config.env] * user_files.is_file(config.env)
-    return named + ["--arm", config.arm] * user_files.is_file(config.arm)
+    return named + user_files.flags(config.env, config.arm)
 
 
 def _video(config: Config) -> Path:

@@ -25,6 +25,12 @@ def is_file(text: str | None) -> bool:
     return _FORM.fullmatch(text or "") is not None
 
 
+def flags(env: str, arm: str) -> list[str]:
+    """Returns the flags that name the files among a run's robot and arm, again."""
+    named = ["--env", env] * is_file(env)
+    return named + ["--arm", arm] * is_file(arm)
+
+
 def digests(texts: Iterable[str | None]) -> dict[str, str]:
     """Returns which files are named, in words, each with a digest of its content."""
     named = (_FORM.fullmatch(text) or [text, text] for text in texts if text)

@@ -25,7 +25,11 @@ Members come first, then rows: `[E, B, ...]`. A reward sees the particles of one
 candidate at one step, `[E, P, D]`, and returns `[E, P]` or `[]`.
 """
 
+from jaxpets import coordinates as coordinates
 from jaxpets import datasets, optimizers, rewards, typing
+from jaxpets import formulas as formulas
+from jaxpets import models as models
+from jaxpets import policies as policies
 from jaxpets._src.agent import agent
 from jaxpets._src.check_space import check_space
 from jaxpets._src.distill import distill

@@ -55,6 +55,14 @@ def test_exploration_is_logged_with_the_tasks_of_the_robot(out):
     assert goals[0] != goals[1] and max(map(abs, goals)) <= 1.0
 
 
+def test_what_comes_next_names_the_files_again(out, capsys):
+    """They run because a command names them, and not as a run's config does."""
+    assert main(["explore", *ROBOT, *ARM, *TINY, "--out", str(out)]) == 0
+    last = capsys.readouterr().err.splitlines()[-1]
+    said = f"zero-shot --from {out / NAME} --env {FILE} --arm {FILE}:novelty"
+    assert last.startswith("next: ") and last.endswith(said)
+
+
 def test_coverage_has_the_axes_of_the_robot(out):
     found = json.loads((out / NAME / "coverage.json").read_text())
     assert found["units"] == ["m", "rad/s"]
