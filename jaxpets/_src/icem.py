@@ -1,5 +1,6 @@
 """iCEM: a cross-entropy method for small budgets."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -207,9 +208,9 @@ def icem(
 
 def _populations(num_samples: int, decay: float, num_iterations: int) -> list[int]:
     """Returns how many samples each iteration would have, were none too few."""
-    with np.errstate(over="ignore"):  # of a large decay nothing is left
-        shares = np.float64(decay) ** np.arange(num_iterations)
-    return [int(num_samples / share) for share in shares]
+    # Beyond e^700 there is no float, and none of any number of samples is left.
+    has_share = [i * math.log(decay) < 700 for i in range(num_iterations)]
+    return [int(num_samples / decay**i) if x else 0 for i, x in enumerate(has_share)]
 
 
 def _numbers(
