@@ -49,9 +49,9 @@ def save_policy(
       TypeError, ValueError: if an argument is not what it should be, or has NaN, or
         space has another size than obs_size.
     """
-    kernel = layers_of(params)["Dense_0"]["kernel"]  # [F + G, hidden]
     check_space_size(space, obs_size)
     box = action_box(action_low, action_high)
+    kernel = layers_of(params)["Dense_0"]["kernel"]  # [F + G, hidden]
     networks = build_networks(kernel.shape[-1], space, _NO_GOALS, box)
     template = _template(networks, space, obs_size, box, kernel.shape[0])
     check_like("params", params, template)

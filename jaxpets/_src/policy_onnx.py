@@ -64,8 +64,8 @@ def to_onnx(
         of the space are functions of your own.
       ImportError: without the package onnx.
     """
-    layers = layers_of(params)
     check_space_size(space, obs_size)
+    layers = layers_of(params)
     box = action_box(action_low, action_high)
     read = _read(space, obs_size)
     mean, std = np.asarray(params.mean), np.asarray(params.std)
