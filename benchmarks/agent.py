@@ -34,17 +34,13 @@ COLUMNS = ("added_ms", "act_ms", "act_p99_ms", "plan_ms", "plan_p99_ms", "copied
            "copied_p99_ms", "memory", "size", "engine")  # fmt: skip
 OF_POLICY = ("onnx_us", "onnx_min_us", "onnx_p99_us", "jax_us", "jax_min_us",
              "jax_p99_us", "hidden_size")  # fmt: skip
+OF_SIZE = ("num_samples", "horizon")  # that may be chosen, too
 Call = Callable[[], np.ndarray]
 
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row."""
-    size = workloads.chosen_size(args)
-    size = dataclasses.replace(
-        size,
-        num_samples=args.num_samples or size.num_samples,
-        horizon=args.horizon or size.horizon,
-    )
+    size = workloads.chosen_size(args, *OF_SIZE)
     planner = workloads.planner(
         size, args.precision, args.optimizer, args.reward, engine=args.engine
     )
@@ -187,11 +183,7 @@ def policy_calls(hidden_size: int) -> tuple[Call, Call]:
 def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Parses the flags, measures and reports."""
     parser = rows.parser(__doc__)
-    workloads.add_size_flag(parser)
-    parser.add_argument(
-        "--num-samples", type=rows.positive, help="candidates, in place of the size's"
-    )
-    parser.add_argument("--horizon", type=rows.positive, help="likewise")
+    workloads.add_size_flag(parser, *OF_SIZE)
     parser.add_argument(
         "--optimizer", choices=workloads.OPTIMIZERS, default="icem", help="search"
     )

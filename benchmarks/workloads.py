@@ -70,20 +70,20 @@ def with_network(size: Size, network: Any) -> Size:
     )
 
 
-def add_size_flag(parser: argparse.ArgumentParser) -> None:
-    """Adds `--size`, and what may differ from it."""
+def add_size_flag(parser: argparse.ArgumentParser, *more: str) -> None:
+    """Adds `--size`, and what may differ from it; `more` names others of its fields."""
     parser.add_argument(
         "--size", choices=("paper", "laptop"), default="paper", help="of the planner"
     )
-    for name in _OTHERS:
+    for name in (*_OTHERS, *more):
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=rows.positive, help="in place of the size's")
 
 
-def chosen_size(args: argparse.Namespace) -> Size:
-    """Returns the size that the flags ask for."""
+def chosen_size(args: argparse.Namespace, *more: str) -> Size:
+    """Returns the size that the flags ask for, with `more` as `add_size_flag` had."""
     size = named_size("tiny" if args.tiny else args.size)
-    others = {name: getattr(args, name, None) for name in _OTHERS}
+    others = {name: getattr(args, name, None) for name in (*_OTHERS, *more)}
     return dataclasses.replace(size, **{x: n for x, n in others.items() if n})
 
 

@@ -218,7 +218,7 @@ class Basics:
     seeds: Annotated[tuple[Seed, ...], EXPLORED, COUNTED] = (0,)
     """One run each, side by side in one program; 0 to 2**32 - 1."""
     engine: EngineName = "mjx"
-    """mjx: physics on the device; mujoco: in C, quicker for fewer than 1000 trials."""
+    """mjx: physics on the device; mujoco: in C, quicker for hundreds of trials."""
     num_trials: Annotated[Trials, EXPLORED, COUNTED, GOAL] = 60
     """Exploration trials, the random ones included; a run may be given more later."""
 

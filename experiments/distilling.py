@@ -198,8 +198,9 @@ def _learned(now: _Run, state: State, planned: Trials) -> ActorCriticParams:
     )  # fmt: skip
     learned = init(params, place(now.keys(0, apart)[..., 0], SEED), dataset)
     if own is not None:  # without its critics: the planner's values are others
-        begun = {x: place(getattr(own, x), SEED) for x in ("actor", "mean", "std")}
-        learned = learned._replace(params=learned.params._replace(**begun))
+        own = place(own, SEED)
+        own = learned.params._replace(actor=own.actor, mean=own.mean, std=own.std)
+        learned = learned._replace(params=own)
     for turn in range(1, settings.num_rounds + 1):
         keys = now.keys(turn, apart)[..., 0]
         learned, metrics = learn(params, place(keys, SEED), learned, dataset)

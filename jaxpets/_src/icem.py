@@ -117,9 +117,7 @@ def icem(
     shape = (horizon, box.center.shape[0])
     num_kept = round(kept_fraction * num_elites)
     smallest = min(num_samples, 2 * num_elites)
-    populations = [
-        max(x, smallest) for x in _populations(num_samples, decay, num_iterations)
-    ]
+    populations = _populations(num_samples, smallest, decay, num_iterations)
 
     def init() -> ICEMState:
         mean = box.start(horizon)
@@ -206,11 +204,16 @@ def icem(
     return TrajectoryOptimizer(init, step)
 
 
-def _populations(num_samples: int, decay: float, num_iterations: int) -> list[int]:
-    """Returns how many samples each iteration would have, were none too few."""
+def _populations(
+    num_samples: int, smallest: int, decay: float, num_iterations: int
+) -> list[int]:
+    """Returns how many samples each iteration draws."""
     # Beyond e^700 there is no float, and none of any number of samples is left.
-    has_share = [i * math.log(decay) < 700 for i in range(num_iterations)]
-    return [int(num_samples / decay**i) if x else 0 for i, x in enumerate(has_share)]
+    last = num_iterations if decay == 1 else math.ceil(700 / math.log(decay))
+    return [
+        max(int(num_samples / decay**i), smallest) if i < last else smallest
+        for i in range(num_iterations)
+    ]
 
 
 def _numbers(

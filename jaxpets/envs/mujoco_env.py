@@ -77,7 +77,7 @@ def mujoco_env(
         a trial begins, in s; a multiple of the environment's step.
       constants: `(key) -> constants` of a trial, as the place of a target, which are in
         EnvState for rewards to read; physics knows nothing of them.
-      backend: "mujoco", C on the cores of the host, for up to a thousand environments;
+      backend: "mujoco", C on the cores of the host, for up to hundreds of worlds;
         or "mjx", JAX on the device, with the same physics in float32.
       num_threads: of "mujoco", over which a batch is spread; by default all cores.
 
