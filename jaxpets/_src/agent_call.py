@@ -99,6 +99,10 @@ class Mailbox:
         ) -> tuple[Array, Any]:
             del slot  # its memory is the action's
             words = jax.device_put(words, jax.memory.Space.Device)
+            # All waits for them, so that XLA makes one CUDA graph of the whole step.
+            params, key, state, words = jax.lax.optimization_barrier(
+                (params, key, state, words)
+            )
             return act(params, key, state, _unpacked(words))
 
         self._act, self._host = act, places.host

@@ -125,6 +125,21 @@ def test_a_step_takes_its_states_memory_and_never_a_planners():
         np.testing.assert_array_equal(kept, 1.0)
 
 
+def test_nothing_of_a_step_goes_before_what_is_given():
+    """Or XLA makes two CUDA graphs of it, which take longer to start than one."""
+    step = compiled(act, places())
+    slot, told = np.zeros(2, np.float32), np.zeros(4, np.int32)
+    program = jax.make_jaxpr(step.program)(slot, start(), 2.0, KEY, told).jaxpr
+    (call,) = program.eqns
+    names = [eqn.primitive.name for eqn in call.params["jaxpr"].eqns]
+    assert names[:2] == ["device_put", "optimization_barrier"] and len(names) > 4
+    waiting = call.params["jaxpr"].eqns[1].invars
+    assert len(waiting) == 4  # params, key, state and what is given
+    late = {id(x) for eqn in call.params["jaxpr"].eqns[2:] for x in eqn.invars}
+    early = [*call.params["jaxpr"].jaxpr.invars, *call.params["jaxpr"].eqns[0].outvars]
+    assert not late & {id(x) for x in early}
+
+
 @pytest.mark.skipif(DEVICE.platform != "cpu", reason="the runtime refuses there")
 def test_what_xla_puts_elsewhere_is_found_there():
     step, places_seen, held = compiled(act, places()), [], None
