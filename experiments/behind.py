@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from .errors import reason
 from .parallel import distributed
 
 
@@ -39,8 +40,18 @@ class Behind:
 
 @contextlib.contextmanager
 def behind() -> Iterator[Behind]:
-    """Gives a thread, which is done on return, also where the caller has failed."""
+    """Gives a thread, which is done on return, also where the caller has failed.
+
+    The caller's error counts then, and that of the last call is said.
+    """
     with ThreadPoolExecutor(1, "jaxpets-behind") as pool:
         found = Behind(pool)
-        yield found
+        try:
+            yield found
+        except BaseException:
+            try:
+                found.wait()
+            except Exception as error:
+                distributed.say(f"warning: the last save failed too: {reason(error)}")
+            raise
         found.wait()

@@ -73,7 +73,7 @@ def test_check_raises_once_the_call_has_failed_and_does_not_wait():
         saving.check()  # it is told once
 
 
-def test_the_callers_error_counts_and_the_call_is_done():
+def test_the_callers_error_counts_and_the_call_is_done(capsys):
     done = []
 
     def work():
@@ -89,6 +89,9 @@ def test_the_callers_error_counts_and_the_call_is_done():
     with pytest.raises(KeyboardInterrupt):
         loop()
     assert done == [1]
+    assert "warning: the last save failed too: OSError: no space" in (
+        capsys.readouterr().err
+    )
 
 
 def test_with_other_processes_a_call_is_done_on_return(monkeypatch):
