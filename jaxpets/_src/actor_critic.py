@@ -101,7 +101,7 @@ def actor_critic(
     check_optimizer(optimizer)
     check_record("config", config, ActorCriticConfig)
     check_space_size(space, obs_size)
-    check_count("num_members", num_members)
+    num_members = check_count("num_members", num_members)
     box = action_box(action_low, action_high)
     sizes = (obs_size, box.center.shape[0])
     networks = build_networks(config.hidden_size, space, goals, box)
@@ -133,9 +133,8 @@ def actor_critic(
         found = networks.init(network_key, goal, dataset)
         found = found._replace(scale=scale, squash=squash)
         opt_state = optimizer.init(cast(Any, (found.actor, found.critics)))
-        return ActorCriticState(
-            found, found.critics, opt_state, obs, rewards, low, high
-        )
+        targets = jax.tree.map(jnp.copy, found.critics)  # all may be donated
+        return ActorCriticState(found, targets, opt_state, obs, rewards, low, high)
 
     def update(
         params: PlanParams, dataset: Dataset, state: ActorCriticState, key: Array

@@ -52,7 +52,7 @@ class ActorCriticConfig:
 
     def __post_init__(self) -> None:
         for name in ("hidden_size", "num_updates", "batch_size", "horizon"):
-            check_count(name, getattr(self, name))
+            keep_checked(self, name, check_count)
         for name in ("discount", "trace", "restart", "target_rate", "pessimism"):
             keep_checked(self, name, check_scalar, 0.0, 1.0)
         for name in ("noise", "squash"):

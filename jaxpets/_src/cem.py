@@ -96,10 +96,10 @@ def cem(
     >>> bool(jnp.all(jnp.abs(solution.actions - 0.5) < 0.05))
     True
     """
-    check_count("horizon", horizon)
+    horizon = check_count("horizon", horizon)
     box = action_box(action_low, action_high)
-    check_elites(num_samples, num_elites)
-    check_count("num_iterations", num_iterations)
+    num_samples, num_elites = check_elites(num_samples, num_elites)
+    num_iterations = check_count("num_iterations", num_iterations)
     momentum = check_scalar("momentum", momentum, 0.0, 1.0)
     min_variance = check_scalar("min_variance", min_variance, 0.0)
     check_flag("legacy_variance", legacy_variance)

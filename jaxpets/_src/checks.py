@@ -20,8 +20,11 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 def check_count(
     name: str, value: Any, minimum: int = 1, maximum: float = math.inf
-) -> None:
-    """Raises unless `value` is a Python integer in `[minimum, maximum]`."""
+) -> int:
+    """Returns `value`, an integer in `[minimum, maximum]`, as Python's, or raises.
+
+    One of NumPy would overflow where it is small, and promote what it meets.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python int, got {value!r} ({kind}).")
@@ -29,6 +32,7 @@ def check_count(
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
     if value > maximum:
         raise ValueError(f"{name} must be at most {maximum}, got {value}.")
+    return int(cast(Any, value))
 
 
 def is_sequence(values: Any) -> TypeGuard[Sequence[Any]]:
@@ -40,9 +44,7 @@ def check_counts(name: str, values: Any) -> tuple[int, ...]:
     """Returns a tuple or list of positive Python integers as a tuple, or raises."""
     if not is_sequence(values):
         raise TypeError(f"{name} must be a tuple of ints, got {values!r}.")
-    for value in values:
-        check_count(name, value)
-    return tuple(values)
+    return tuple(check_count(name, value) for value in values)
 
 
 def check_flag(name: str, value: Any) -> None:

@@ -107,7 +107,7 @@ def distill(
     check_optimizer(optimizer)
     check_record("config", config, DistillConfig)
     check_space_size(space, obs_size)
-    check_count("num_members", num_members)
+    num_members = check_count("num_members", num_members)
     box = action_box(action_low, action_high)
     sizes = (obs_size, box.center.shape[0])
     networks = build_networks(config.hidden_size, space, goals, box)
@@ -144,8 +144,10 @@ def distill(
         shapes = (found.mean.shape, box.center.shape, (), ())
         plans = Plans(*(jnp.zeros((capacity, *x), jnp.float32) for x in shapes))
         opt_state = optimizer.init(cast(Any, (found.actor, found.critics)))
-        none = jnp.zeros((), jnp.int32)
-        return DistillState(found, opt_state, obs, rewards, planning, plans, none, none)
+        size, cursor = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+        return DistillState(
+            found, opt_state, obs, rewards, planning, plans, size, cursor
+        )
 
     def step(
         params: PlanParams, key: Array, state: DistillState, dataset: Dataset

@@ -43,7 +43,7 @@ class DistillConfig:
     def __post_init__(self) -> None:
         for name in ("hidden_size", "num_trials", "horizon", "capacity", "num_updates",
                      "batch_size"):  # fmt: skip
-            check_count(name, getattr(self, name))
+            keep_checked(self, name, check_count)
         keep_checked(self, "planned", check_scalar, 0.0, 1.0)
         keep_checked(self, "noise", check_scalar, 0.0)
         keep_checked(self, "restart", check_scalar, 0.0, 1.0)

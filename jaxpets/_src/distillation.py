@@ -91,11 +91,11 @@ def random_network_distillation(
       TypeError, ValueError: for an optimizer or a size that is none.
     """
     check_optimizer(optimizer)
-    check_count("obs_size", obs_size)
-    check_count("hidden_size", hidden_size)
-    check_count("num_features", num_features)
-    check_count("num_epochs", num_epochs)
-    check_count("batch_size", batch_size)
+    obs_size = check_count("obs_size", obs_size)
+    hidden_size = check_count("hidden_size", hidden_size)
+    num_features = check_count("num_features", num_features)
+    num_epochs = check_count("num_epochs", num_epochs)
+    batch_size = check_count("batch_size", batch_size)
 
     def init(key: Array) -> DistillationState:
         check_key("key", key)
@@ -126,7 +126,9 @@ def random_network_distillation(
 
         def update(i: Array, fit: tuple[Layers, Any]) -> tuple[Layers, Any]:
             predictor, opt_state = fit
-            batch = i % num_batches + num_batches * jnp.arange(batch_size)
+            batch = i % num_batches + num_batches * jnp.arange(
+                batch_size, dtype=jnp.int32
+            )
             shown = jnp.take(inputs, batch, axis=0, mode="clip")
             counts = jnp.take(weight, batch, mode="fill", fill_value=0.0)
             grad_fn = cast(Callable[..., Any], jax.grad(_loss))

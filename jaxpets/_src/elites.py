@@ -29,14 +29,15 @@ class Elites(NamedTuple):
     value: Array
 
 
-def check_elites(num_samples: int, num_elites: int) -> None:
-    """Raises unless there are two elites at least, and no fewer samples."""
-    check_count("num_elites", num_elites, minimum=2)
-    check_count("num_samples", num_samples)
+def check_elites(num_samples: int, num_elites: int) -> tuple[int, int]:
+    """Returns both, or raises: there are two elites at least, and no fewer samples."""
+    num_elites = check_count("num_elites", num_elites, minimum=2)
+    num_samples = check_count("num_samples", num_samples)
     if num_samples < num_elites:
         raise ValueError(
             f"num_samples must be at least num_elites, {num_elites}, got {num_samples}."
         )
+    return num_samples, num_elites
 
 
 def join_iterations(tried: Any) -> Any:

@@ -45,7 +45,7 @@ class EnsembleConfig:
     activation: str = "swish"
 
     def __post_init__(self) -> None:
-        check_count("num_members", self.num_members)
+        keep_checked(self, "num_members", check_count)
         keep_checked(self, "hidden_sizes", check_counts)
         num_layers = len(self.hidden_sizes) + 1
         keep_checked(self, "weight_decays", _check_decays, num_layers)

@@ -33,8 +33,8 @@ class FitConfig:
     bootstrap: bool = True
 
     def __post_init__(self) -> None:
-        check_count("num_epochs", self.num_epochs)
-        check_count("batch_size", self.batch_size)
+        keep_checked(self, "num_epochs", check_count)
+        keep_checked(self, "batch_size", check_count)
         keep_checked(self, "final_rate", check_real, 0.0, 1.0)
         check_flag("bootstrap", self.bootstrap)
 

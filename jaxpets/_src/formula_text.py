@@ -146,7 +146,7 @@ def parse(text: str, names: Mapping[str, int], action_size: int = 0) -> Formula:
     """
     if not isinstance(text, str):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"text must be a str, got {text!r}.")
-    check_count("action_size", action_size, 0)
+    action_size = check_count("action_size", action_size, 0)
     words = _places("names", names)
     actions = {f"action_{i}": i for i in range(action_size)}
     try:

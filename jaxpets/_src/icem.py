@@ -73,7 +73,8 @@ def icem(
     Against `cem`: noise is correlated over time, with power `1 / f^noise_beta`; a share
     of the elites enters the next iteration and, shifted by one step, the next call;
     iteration i draws `num_samples / decay^i` samples, never fewer than two times
-    the elites; the last iteration also tries the mean itself.
+    the elites or, if that is less, `num_samples`; the last iteration also tries the
+    mean itself.
 
     Args:
       horizon: H.
@@ -106,10 +107,10 @@ def icem(
     Raises:
       TypeError, ValueError: for a size, number or bound that cannot be searched with.
     """
-    check_count("horizon", horizon)
+    horizon = check_count("horizon", horizon)
     box = action_box(action_low, action_high)
-    check_elites(num_samples, num_elites)
-    check_count("num_iterations", num_iterations)
+    num_samples, num_elites = check_elites(num_samples, num_elites)
+    num_iterations = check_count("num_iterations", num_iterations)
     momentum, noise_beta, init_std = _numbers(
         momentum, noise_beta, init_std, kept_fraction, decay
     )
@@ -151,7 +152,7 @@ def icem(
     def loop(
         objective_fn: ObjectiveFn, keys: Array, noises: Sequence[Array], found: _Found
     ) -> tuple[_Found, Any]:
-        row = jnp.arange(num_samples + num_kept + 1)
+        row = jnp.arange(num_samples + num_kept + 1, dtype=jnp.int32)
 
         def iterate(found: _Found, inputs: tuple[Array, ...]) -> tuple[_Found, Any]:
             key, noise, population, is_last = inputs

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src import dataset as datasets
@@ -135,8 +136,8 @@ def learner(
     check_record("ensemble", ensemble, Ensemble)
     check_record("fitter", fitter, Fitter)
     check_functions("reward_data", reward_data, RewardData)
-    check_count("trial_length", trial_length)
-    check_count("capacity", capacity, minimum=trial_length)
+    trial_length = check_count("trial_length", trial_length)
+    capacity = check_count("capacity", capacity, minimum=trial_length)
     box = action_box(env.action_low, env.action_high)
     start = jax.eval_shape(functools.partial(reset, env), jax.random.key(0))
     sizes = (start.obs.shape[0], box.low.shape[0])
@@ -204,7 +205,7 @@ def new_state(
     params = ensemble.init(model_key) if params is None else params
     dataset = datasets.init(capacity, ensemble.obs_size, ensemble.action_size)
     reward = reward_data.refresh(reward_data.init(reward_key), params, dataset)
-    return LearnerState(params, fitter.init(params), dataset, reward)
+    return LearnerState(params, fitter.init(params), dataset, _own(reward))
 
 
 def fitted(
@@ -215,4 +216,12 @@ def fitted(
     reward = reward_data.refresh(state.reward, params, state.dataset)
     # Another shape would retrace every plan.
     check_like("reward_data.refresh's result", reward, state.reward)
-    return LearnerState(params, fit, state.dataset, reward), metrics
+    return LearnerState(params, fit, state.dataset, _own(reward)), metrics
+
+
+def _own(reward: Any) -> Any:
+    """Returns a copy, as the data of a reward may be the parameters themselves.
+
+    So all of a state has memory of its own, and may be donated.
+    """
+    return jax.tree.map(jnp.copy, reward)

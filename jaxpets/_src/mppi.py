@@ -71,10 +71,10 @@ def mppi(
     Raises:
       TypeError, ValueError: for a size, number or bound that cannot be searched with.
     """
-    check_count("horizon", horizon)
+    horizon = check_count("horizon", horizon)
     box = action_box(action_low, action_high)
-    check_count("num_samples", num_samples, minimum=2)
-    check_count("num_iterations", num_iterations)
+    num_samples = check_count("num_samples", num_samples, minimum=2)
+    num_iterations = check_count("num_iterations", num_iterations)
     std = check_scalar("std", std, 1e-6)
     temperature = check_scalar("temperature", temperature, 1e-6)
     check_flag("keep_candidates", keep_candidates)

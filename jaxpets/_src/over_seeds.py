@@ -42,7 +42,7 @@ def over_seeds(learner: Learner, num_seeds: int) -> Learner:
         functions, unless there are as many keys, states and transitions.
     """
     check_record("learner", learner, Learner)
-    check_count("num_seeds", num_seeds)
+    num_seeds = check_count("num_seeds", num_seeds)
 
     def init(keys: Array) -> LearnerState:
         check_keys("keys", keys, num_seeds)
@@ -116,8 +116,8 @@ def _only(tree: Any) -> Any:
 
 def _many(tree: Any) -> Any:
 
-    def many(x: Array) -> Array:
-        return x[None]
+    def many(x: Any) -> Array:
+        return jnp.asarray(x)[None]  # it may be a number of Python
 
     return jax.tree.map(many, tree)
 

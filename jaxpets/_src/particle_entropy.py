@@ -41,7 +41,7 @@ def visited_states(dataset: Dataset, num_states: int) -> VisitedStates:
       TypeError, ValueError: unless dataset is one and num_states a positive int.
     """
     check_record("dataset", dataset, Dataset)
-    check_count("num_states", num_states)
+    num_states = check_count("num_states", num_states)
     obs = dataset.data.next_obs
     check_array("dataset.data.next_obs", obs, ["C", "D"])
     mean, std = moments(obs, dataset.size)
@@ -77,13 +77,13 @@ def particle_entropy(num_neighbors: int = 12) -> RewardFn:
     Raises:
       TypeError, ValueError: unless num_neighbors is a positive int.
     """
-    check_count("num_neighbors", num_neighbors)
+    num_neighbors = check_count("num_neighbors", num_neighbors)
 
     def reward(params: Any, obs: Array, action: Array, next_obs: Array) -> Array:
         del obs, action
         check_record("params", params, VisitedStates)
         num_states, obs_size = params.states.shape
-        check_count("num_states", num_states, minimum=num_neighbors)
+        num_states = check_count("num_states", num_states, minimum=num_neighbors)
         check_array("next_obs", next_obs, ["...", obs_size])
         scaled = (next_obs - params.mean) / params.std
         # By differences, not by products, which lose short distances to rounding.
@@ -91,7 +91,7 @@ def particle_entropy(num_neighbors: int = 12) -> RewardFn:
         square = jnp.where(params.used, square, jnp.inf)
         nearest, _ = jax.lax.top_k(-square, num_neighbors)
         count = jnp.minimum(jnp.sum(params.used), num_neighbors)
-        found = jnp.arange(num_neighbors) < count
+        found = jnp.arange(num_neighbors, dtype=jnp.int32) < count
         total = jnp.sum(jnp.where(found, jnp.sqrt(-nearest), 0.0), axis=-1)
         entropy = jnp.log1p(total / jnp.maximum(count, 1).astype(jnp.float32))
         # Of no neighbours the sum would be 0, whatever there is to compare.

@@ -103,7 +103,7 @@ def plan(
     check_callable("rollout_fn", rollout_fn)
     check_record("optimizer", optimizer, TrajectoryOptimizer)
     if chunk_size is not None:
-        check_count("chunk_size", chunk_size)
+        chunk_size = check_count("chunk_size", chunk_size)
 
     wanted: Any = None
     if propose_fn is not None:

@@ -38,8 +38,8 @@ def prior(
     """
     check_record("policy", policy, Planner)
     check_callable("dynamics_fn", dynamics_fn)
-    check_count("horizon", horizon)
-    check_count("num_members", num_members)
+    horizon = check_count("horizon", horizon)
+    num_members = check_count("num_members", num_members)
     each = jax.vmap(policy.step, (None, 0, None, 0))
 
     def propose(params: PlanParams, key: Array, obs: Array) -> Array:

@@ -45,8 +45,8 @@ def simhash(key: Array, num_bits: int, obs_size: int) -> Array:
       TypeError, ValueError: unless `1 <= num_bits <= 32`.
     """
     check_key("key", key)
-    check_count("num_bits", num_bits, maximum=_MAX_BITS)
-    check_count("obs_size", obs_size)
+    num_bits = check_count("num_bits", num_bits, maximum=_MAX_BITS)
+    obs_size = check_count("obs_size", obs_size)
     return jax.random.normal(key, (num_bits, obs_size), jnp.float32)
 
 

@@ -64,7 +64,7 @@ def random_planner(
     """
     box = action_box(action_low, action_high)
     noise_beta = check_real("noise_beta", noise_beta, 0.0)
-    check_count("period", period, minimum=2)
+    period = check_count("period", period, minimum=2)
     if noise_beta:
         return _colored(box, noise_beta, period)
 

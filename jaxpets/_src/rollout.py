@@ -41,8 +41,8 @@ def particle_rollout(
         does not fit.
     """
     check_callable("dynamics_fn", dynamics_fn)
-    check_count("num_members", num_members)
-    check_count("num_particles", num_particles)
+    num_members = check_count("num_members", num_members)
+    num_particles = check_count("num_particles", num_particles)
     if num_particles % num_members:
         raise ValueError(
             f"num_particles must be a multiple of num_members ({num_members}), "

@@ -108,7 +108,7 @@ def unroll(
     check_record("params", params, PlanParams)
     check_key("key", key)
     check_record("state", state, UnrollState)
-    check_count("length", length)
+    length = check_count("length", length)
     check_callable("observe_fn", observe_fn)
 
     def tick(

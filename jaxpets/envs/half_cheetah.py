@@ -150,8 +150,8 @@ def half_cheetah(*, iterations: int = 8, ls_iterations: int = 8) -> Env:
     Raises:
       TypeError, ValueError: unless the two are positive Python integers.
     """
-    check_count("iterations", iterations)
-    check_count("ls_iterations", ls_iterations)
+    iterations = check_count("iterations", iterations)
+    ls_iterations = check_count("ls_iterations", ls_iterations)
     model = load_model()
     model.opt.iterations = iterations
     model.opt.ls_iterations = ls_iterations

@@ -95,7 +95,7 @@ def mujoco_env(
         if function is not None:
             check_callable(name, function)
     if num_threads is not None:
-        check_count("num_threads", num_threads)
+        num_threads = check_count("num_threads", num_threads)
     check_real("settle_time", settle_time, 0.0)
     # C MuJoCo reads it at every step, and whoever has it may make another robot of it.
     model = copy.copy(load_model(model))
@@ -202,7 +202,7 @@ def _control_names(model: Any) -> list[str]:
 
 def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:
     check_real("control_step", control_step, 0.0)
-    check_count("action_repeat", action_repeat)
+    action_repeat = check_count("action_repeat", action_repeat)
     ratio = control_step / model.opt.timestep
     count = max(1, round(ratio))
     if abs(ratio - count) > 1e-6 * count:

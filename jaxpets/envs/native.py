@@ -60,7 +60,7 @@ def native_physics(
       TypeError, ValueError: unless the counts are positive Python integers, and the
         state of the model is its positions, velocities and activations.
     """
-    check_count("num_substeps", num_substeps)
+    num_substeps = check_count("num_substeps", num_substeps)
     check_state(model)
     model = copy.copy(model)  # whoever has it may change it
     ends = np.cumsum([model.nq, model.nv, model.na, model.nv]).tolist()
@@ -229,7 +229,7 @@ def _host_function(
     """
     if num_threads is None:
         num_threads = _num_cores()
-    check_count("num_threads", num_threads)
+    num_threads = check_count("num_threads", num_threads)
     lock = threading.Lock()
     _batch(model, 1, 1)  # now, and not in a program, is the time to say that it cannot
     batches: list[Any] = []  # one, as large as the largest call

@@ -9,9 +9,13 @@ from jaxpets._src import checks
 from jaxpets._src.action_box import action_box
 
 
-@pytest.mark.parametrize("value", [1, 7, np.int32(3)])
+@pytest.mark.parametrize("value", [1, 7, np.int32(3), np.uint8(200)])
 def test_count_takes_integers(value):
-    checks.check_count("num", value)
+    """And returns those of Python, which do not overflow."""
+    found = checks.check_count("num", value)
+    assert type(found) is int and found == value
+    (found,) = checks.check_counts("nums", [value])
+    assert type(found) is int and found == value
 
 
 @pytest.mark.parametrize("value", [True, 2.0, "3", None, jnp.int32(3)])
@@ -65,6 +69,33 @@ def test_a_number_of_numpy_becomes_one_of_python(value):
 def test_a_config_keeps_numbers_of_python(config, name):
     """Those of NumPy make float64 of what they meet under x64."""
     assert type(getattr(config(**{name: np.float64(0.5)}), name)) is float
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        (jaxpets.EnsembleConfig, "num_members"),
+        (jaxpets.FitConfig, "num_epochs"),
+        (jaxpets.FitConfig, "batch_size"),
+        (policies.ActorCriticConfig, "batch_size"),
+        (policies.DistillConfig, "num_trials"),
+    ],
+)
+def test_a_config_keeps_integers_of_python(config, name):
+    assert type(getattr(config(**{name: np.uint8(8)}), name)) is int
+
+
+def test_a_search_of_small_integers_of_numpy_does_not_overflow():
+    search = jaxpets.optimizers.icem(
+        horizon=np.uint8(3), action_low=-np.ones(1), action_high=np.ones(1),
+        num_samples=np.uint8(100), num_elites=np.uint8(70),
+        num_iterations=np.uint8(2), keep_candidates=True,
+    )  # fmt: skip
+    solution, _ = search.step(
+        lambda key, actions: jnp.sum(actions, (1, 2)), jax.random.key(0), search.init()
+    )
+    # Twice: samples, and 0.3 of the elites of before; the mean at last.
+    assert solution.candidates.values.shape == (2 * (100 + 21) + 1,)
 
 
 @pytest.mark.parametrize("value", [0.1, 1, np.float32(0.1), jnp.float32(0.1)])

@@ -101,6 +101,14 @@ def test_one_policy_goes_where_the_planner_goes_for_every_task():
             assert np.abs(own[-10:] - target).max() < 0.3
 
 
+def test_a_state_made_outside_of_jit_can_be_donated():
+    distiller, known = build(num_updates=1, horizon=1), PlanParams(GAIN, TARGETS)
+    state = distiller.init(known, jax.random.key(0), states())
+    step = jax.jit(distiller.step, donate_argnums=2)
+    _, metrics = step(known, jax.random.key(1), state, states())
+    assert metrics.num_skipped == 0
+
+
 def test_it_gets_closer_to_the_planner():
     *_, said = learned()
     errors = [metrics.error for metrics in said]

@@ -194,6 +194,37 @@ def test_a_state_made_outside_of_jit_can_be_donated(num_seeds):
     assert after.dataset.size == LENGTH and state.dataset.size.is_deleted()
 
 
+@pytest.mark.parametrize("num_seeds", [None, 1, 2])
+def test_so_can_one_whose_reward_reads_the_parameters(num_seeds):
+    """As the data of opax or plan2explore do."""
+    learner, keys = build(RewardData(refresh=lambda _, params, __: params)), keys_of()
+    if num_seeds:
+        learner, keys = jaxpets.over_seeds(learner, num_seeds), keys_of(num_seeds)
+    state = learner.init(keys[0])
+    assert_every_leaf_is_a_buffer_of_its_own(state)
+    chunk = toys.transitions(LENGTH)
+    if num_seeds:
+        chunk = jax.tree.map(lambda x: jnp.repeat(x[None], num_seeds, axis=0), chunk)
+    state, _ = learner.learn(keys[1], state, chunk)
+    assert_every_leaf_is_a_buffer_of_its_own(state)
+
+
+def test_data_of_a_reward_may_be_numbers_of_python():
+    """The weight of a mixture may be one; one seed has no other way than two."""
+    mixed = jaxpets.rewards.MixtureData
+    reward_data = RewardData(
+        refresh=lambda _, params, __: mixed(
+            (), jaxpets.rewards.max_variance(params), 0.5
+        )
+    )
+    for num_seeds in (1, 2):
+        learner = jaxpets.over_seeds(build(reward_data), num_seeds)
+        keys = keys_of(num_seeds)
+        step = jax.jit(functools.partial(learner.step, CHANCE))
+        state, _ = step(keys[1], jax.jit(learner.init)(keys[0]))
+        np.testing.assert_array_equal(state.reward.weight, np.full(num_seeds, 0.5))
+
+
 def test_a_dataset_made_outside_of_jit_can_be_donated():
     dataset = jaxpets.datasets.init(CAPACITY, 2, 1)
     assert_every_leaf_is_a_buffer_of_its_own(dataset)
