@@ -86,10 +86,10 @@ def agent(
     check_record("fitter", fitter, Fitter)
     check_record("random_planner", random_planner, Planner)
     check_functions("reward_data", reward_data, RewardData)
-    check_count("capacity", capacity)
-    check_count("seed", seed, 0, 2**32 - 1)  # JAX cuts off what is above
+    capacity = check_count("capacity", capacity)
+    seed = check_count("seed", seed, 0, 2**32 - 1)  # JAX cuts off what is above
     if num_envs is not None:
-        check_count("num_envs", num_envs)
+        num_envs = check_count("num_envs", num_envs)
     if params is not None:
         params_check(model.init)(params)
     world = World(model.obs_size, num_envs, autoreset_of(autoreset, num_envs))
@@ -207,8 +207,8 @@ class Agent:
         """Remembers what the last action led to.
 
         A transition goes from the `obs` that `act` saw to `next_obs`, and never from
-        the end of a trial to the start of the next. Of N worlds, one that has diverged
-        does not stop the others: only its transitions are left out.
+        the end of a trial to the start of the next. Where a world has diverged, with a
+        number beyond 1e10 or of N worlds one not finite, its transition is left out.
 
         Args:
           next_obs: `[D]` or `[N, D]`.
@@ -230,8 +230,8 @@ class Agent:
         done = done | told.flags(world, "truncated", truncated)
         reached = told.last_obs(world, next_obs, done, info)
         obs, action = self._awaited
-        is_finite = told.are_finite(obs, reached)
-        kept = ~self._is_resetting & is_finite
+        is_stable = told.are_stable(obs, reached)
+        kept = ~self._is_resetting & is_stable
         if kept.any():
             self._seen.append((obs[kept], action[kept], reached[kept]))
         self._counts = self._counts._replace(steps=self.num_steps + int(kept.sum()))
@@ -242,7 +242,7 @@ class Agent:
             self._is_resetting = done & ~self._is_resetting
         else:
             self._is_new |= done
-        self._is_new |= ~is_finite
+        self._is_new |= ~is_stable
 
     def learn(self) -> FitMetrics:
         """Trains the model on all that was observed; best called after a trial.

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxpets._src.dataset import MAX_SIZE
 from jaxpets._src.types import Dataset, Transition
 
 # What was observed and is not yet in the dataset: obs, action, next_obs of each step.
@@ -54,7 +55,7 @@ def autoreset_of(value: Any, num_envs: int | None) -> str:
 def numbers(world: World, name: str, value: Any) -> np.ndarray:
     """Returns a copy of observations as float32, `[D]` or `[N, D]`.
 
-    Of N worlds one may have diverged, which the others cannot help; see `are_finite`.
+    Of N worlds one may have diverged, which the others cannot help; see `are_stable`.
 
     Raises:
       TypeError, ValueError: if they are not of this shape, or of a single world and
@@ -81,9 +82,10 @@ def numbers(world: World, name: str, value: Any) -> np.ndarray:
     return array
 
 
-def are_finite(*arrays: np.ndarray) -> np.ndarray:
-    """Tells `[]` or `[N]` which worlds have finite numbers in all of `[..., *]`."""
-    return np.logical_and.reduce([np.isfinite(x).all(axis=-1) for x in arrays])
+def are_stable(*arrays: np.ndarray) -> np.ndarray:
+    """Tells `[]` or `[N]` which worlds have not diverged, in all of `[..., *]`."""
+    good = [(np.abs(x) <= MAX_SIZE).all(axis=-1) for x in arrays]  # nor is NaN
+    return np.logical_and.reduce(good)
 
 
 def flags(world: World, name: str, value: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ _SHARED: Any = None
 # would select between old and new parameters: a third more time on a GPU.
 AXES = Dataset(data=_MAPPED, size=_SHARED, cursor=_SHARED)
 # What MuJoCo holds for diverged, its mjMAXVAL. Squares of less fit into float32.
-_MAX_SIZE = 1e10
+MAX_SIZE = 1e10
 
 
 def init(capacity: int, obs_size: int, action_size: int) -> Dataset:
@@ -32,9 +32,9 @@ def init(capacity: int, obs_size: int, action_size: int) -> Dataset:
     Raises:
       TypeError, ValueError: unless all are positive Python integers.
     """
-    check_count("capacity", capacity)
-    check_count("obs_size", obs_size)
-    check_count("action_size", action_size)
+    capacity = check_count("capacity", capacity)
+    obs_size = check_count("obs_size", obs_size)
+    action_size = check_count("action_size", action_size)
     # Every array is a buffer of its own, so that a caller may donate them all.
     obs, action, next_obs = (
         jnp.zeros((capacity, size), jnp.float32)
@@ -68,7 +68,8 @@ def append(
             raise TypeError(f"count must be int32[], got {count!r}.")
         added = jnp.clip(count, 0, length).astype(jnp.int32)
         # Beyond the last row nothing is written.
-        rows = jnp.where(jnp.arange(length) < added, rows, capacity)
+        row = jnp.arange(length, dtype=jnp.int32)
+        rows = jnp.where(row < added, rows, capacity)
     data = Transition(
         *(
             jnp.asarray(old).at[rows].set(new)
@@ -97,7 +98,7 @@ def num_stable(transitions: Transition) -> Array:
     """
     check_record("transitions", transitions, Transition)
     # Number by number: XLA's maximum of many rows on a CPU passes over what is NaN.
-    good = (jnp.all(jnp.abs(x) <= _MAX_SIZE, axis=-1) for x in transitions)
+    good = (jnp.all(jnp.abs(x) <= MAX_SIZE, axis=-1) for x in transitions)
     is_good = functools.reduce(jnp.logical_and, good)
     obs, next_obs = (
         jnp.max(jnp.abs(x), axis=-1) for x in (transitions.obs, transitions.next_obs)
@@ -192,7 +193,7 @@ def grow(dataset: Dataset, capacity: int) -> Dataset:
     """
     _check_dataset(dataset)
     old = dataset.data.obs.shape[0]
-    check_count("capacity", capacity, minimum=old)
+    capacity = check_count("capacity", capacity, minimum=old)
 
     def widen(rows: Array) -> Array:
         rows = jnp.roll(

@@ -153,6 +153,25 @@ def test_what_waits_to_be_learned_is_no_more_than_the_capacity(make, trained):
     assert sorted(rows(two)) == [(5, 6), (7, 8), (8, 9)] and two.num_steps == 6
 
 
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_what_is_beyond_mujocos_largest_number_is_left_out(
+    make, trained, num_envs, tmp_path
+):
+    """Or its square, and what is divided by it, would be no number any more."""
+    agent = make(params=trained, num_envs=num_envs)
+    for step in range(6):
+        far = 1e12 if step == 2 else step + 1
+        one, other = (at(step), at(far)), (at(step), at(step + 1))
+        obs, reached = one if num_envs is None else zip(one, other, strict=True)
+        agent.act(obs)
+        agent.observe(reached)
+    assert agent.num_steps == (5 if num_envs is None else 11)
+    assert np.abs([list(x) for x in rows(agent)]).max() < 10
+    assert agent.learn().num_skipped == 0
+    agent.save(tmp_path / "a")
+    make(params=trained, num_envs=num_envs).load(tmp_path / "a")
+
+
 def test_a_file_that_is_no_agent_is_refused(make, trained, tmp_path):
     path = tmp_path / "m"
     agent = make(params=trained)
