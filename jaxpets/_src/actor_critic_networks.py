@@ -9,7 +9,12 @@ from jax import Array
 
 from jaxpets._src.action_box import ActionBox
 from jaxpets._src.actor_critic_records import ActorCriticParams, Goals, Guided
-from jaxpets._src.checks import check_callable, check_functions, check_record
+from jaxpets._src.checks import (
+    check_array,
+    check_callable,
+    check_functions,
+    check_record,
+)
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Head
 from jaxpets._src.symlog import symexp
@@ -123,6 +128,7 @@ def build_networks(
         params: PlanParams, key: Array, state: tuple[()], obs: Array
     ) -> tuple[PlanOutput, tuple[()]]:
         del key
+        check_array("obs", obs, [len(space.coordinates) or "D"])
         action, value = decide(params.reward, obs)
         return PlanOutput(action, action[None], value), state
 

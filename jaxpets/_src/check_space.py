@@ -24,7 +24,8 @@ def check_space(
       space: what to try.
       obs: `[T, D]`, as a Transition has them; at least one row.
       next_obs: `[T, D]`.
-      tolerance: how far an entry may be off, as a share of the largest number in it.
+      tolerance: how far an entry may be off, as a share of the largest number in it or,
+        where that is less, of 1: data of a small unit are best tried in a larger one.
 
     Raises:
       TypeError, ValueError: naming the entry that is wrong, and by how much.
@@ -66,7 +67,7 @@ def check_space_size(space: Any, obs_size: Any) -> None:
     entries out, without a word. A space of functions of your own cannot say its size.
     """
     check_record("space", space, ModelSpace)
-    check_count("obs_size", obs_size)
+    obs_size = check_count("obs_size", obs_size)
     size = len(space.coordinates)
     if size not in (0, obs_size):
         raise ValueError(f"obs_size must be {size} as of space, got {obs_size}.")

@@ -132,7 +132,7 @@ def ensemble(
     """
     check_record("config", config, EnsembleConfig)
     check_space_size(space, obs_size)
-    check_count("action_size", action_size)
+    action_size = check_count("action_size", action_size)
     feature_size = space.features(jnp.zeros((obs_size,), jnp.float32)).shape[-1]
     input_size = feature_size + action_size
     decays = layer_decays(config)
@@ -259,7 +259,9 @@ def params_check(
 def _observed_range(data: Transition, size: Array) -> tuple[Array, Array]:
     """Returns the least and greatest observation `[D]` in the first `size` rows."""
     obs = jnp.stack([data.obs, data.next_obs])
-    used = (jnp.arange(obs.shape[1]) < size)[:, None] & jnp.isfinite(obs)
+    used = (jnp.arange(obs.shape[1], dtype=jnp.int32) < size)[:, None] & jnp.isfinite(
+        obs
+    )
     low = jnp.min(jnp.where(used, obs, jnp.inf), axis=(0, 1))
     high = jnp.max(jnp.where(used, obs, -jnp.inf), axis=(0, 1))
     # Without data there is no range to keep to.

@@ -124,7 +124,8 @@ def reward(formula: Formula, obs: Array, action: Array, next_obs: Array) -> Arra
     Returns:
       `[...]`, in the unit of the formula. Where it has no value, as at a division by
       zero or where an entry that it reads is not finite, neither is it, which `plan`
-      rejects. A comparison, `clip` or `tanh` of what has no value may have one.
+      rejects. A comparison, `clip`, `tanh` or `tolerance` of what has no value may
+      have one.
 
     Raises:
       TypeError: if formula is not a Formula.

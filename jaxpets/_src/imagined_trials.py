@@ -163,7 +163,9 @@ def reward_range(
 
     capacity = dataset.data.obs.shape[0]
     rewards = jax.vmap(of_row)(jax.random.split(key, capacity), dataset.data)
-    used = (jnp.arange(capacity) < dataset.size) & jnp.isfinite(rewards)
+    used = (jnp.arange(capacity, dtype=jnp.int32) < dataset.size) & jnp.isfinite(
+        rewards
+    )
     rewards = jnp.where(used, rewards, 0.0)
     return jnp.minimum(jnp.min(rewards), 0.0), jnp.maximum(jnp.max(rewards), 0.0)
 

@@ -9,7 +9,8 @@ _MIN_STD = 1e-6
 
 def counted(rows: Array, size: Array) -> Array:
     """Returns which rows of `[C, F]` count, `[C]`: the first `size`, if finite."""
-    return (jnp.arange(rows.shape[0]) < size) & jnp.all(jnp.isfinite(rows), axis=1)
+    number = jnp.arange(rows.shape[0], dtype=jnp.int32)
+    return (number < size) & jnp.all(jnp.isfinite(rows), axis=1)
 
 
 def moments(rows: Array, size: Array) -> tuple[Array, Array]:
@@ -19,8 +20,9 @@ def moments(rows: Array, size: Array) -> tuple[Array, Array]:
     """
     used = counted(rows, size)[:, None]
     count = jnp.maximum(jnp.sum(used), 1).astype(jnp.float32)
-    # From the first row, where the mean of a constant column is exact.
-    first = jnp.where(used[0], rows[0], 0.0)
+    # From the first that counts, where the mean of a constant column is exact.
+    row = jnp.argmax(used[:, 0])
+    first = jnp.where(used[row], rows[row], 0.0)
     mean = first + jnp.sum(jnp.where(used, rows - first, 0.0), axis=0) / count
     square = jnp.where(used, (rows - mean) ** 2, 0.0)
     std = jnp.sqrt(jnp.sum(square, axis=0) / count)

@@ -358,6 +358,29 @@ def test_states_of_numpy_are_begun_at_outside_jit():
     assert metrics.reward == 2.0 and metrics.num_skipped == 0
 
 
+def test_a_state_made_outside_of_jit_can_be_donated():
+    learner = build(num_updates=1)
+    params = PlanParams(WORLD, Task(*map(jnp.float32, TASKS["two"])))
+    state = learner.init(params, jax.random.key(0), states(20))
+    step = jax.jit(learner.step, donate_argnums=2)
+    _, metrics = step(params, jax.random.key(1), state, states(20))
+    assert metrics.num_skipped == 0 and state.targets["params"]
+
+
+def test_an_observation_of_another_size_is_refused():
+    row = jaxpets.coordinates.Coordinate
+    rows = jaxpets.coordinates.space([row("x"), row("v")])
+    learner = build(num_updates=1, space=rows)
+    params = PlanParams(WORLD, Task(*map(jnp.float32, TASKS["two"])))
+    networks = learner.init(params, jax.random.key(0), states(20)).params
+    known = PlanParams((), Guided(params.reward, networks))
+    for size in (1, 3, 4):
+        with pytest.raises(
+            ValueError, match=rf"obs must be float32\[2\], got .*\[{size}\]"
+        ):
+            learner.policy.step(known, jax.random.key(0), (), jnp.zeros(size))
+
+
 def test_steps_that_are_not_finite_are_dropped():
     learned = learn("broken state")
     assert learned.metrics.num_skipped == NUM_UPDATES

@@ -49,6 +49,22 @@ def test_no_key_is_used_twice(key):
         jax.jit(lambda key, state: LEARNER.step(EXPLORER, key, state)).trace(key, state)
 
 
+@pytest.mark.parametrize("unroll", [True, False])
+def test_types_are_float32_and_int32_where_64_bits_are_enabled(key, unroll):
+    """And nothing is promoted without a word."""
+    search = jaxpets.optimizers.icem(
+        horizon=3, action_low=ENV.action_low, action_high=ENV.action_high, unroll=unroll
+    )
+    planner = jaxpets.plan(ROLLOUT, jaxpets.rewards.epistemic, search)
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"):
+        learner = build()
+        state, _ = jax.eval_shape(
+            lambda key: learner.step(planner, key, learner.init(key)), key
+        )
+    kinds = {x.dtype for x in jax.tree.leaves(state)}
+    assert kinds == {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32)}
+
+
 def test_starts_with_nothing_but_a_model(key):
     state = INIT(key)
     assert state.dataset.size == 0

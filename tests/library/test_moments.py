@@ -32,6 +32,14 @@ def test_a_constant_column_has_no_noise_of_rounding():
     np.testing.assert_array_equal(std, 1.0)
 
 
+def test_nor_has_one_whose_first_row_does_not_count():
+    rows = np.full((1000, 2), 1234.567, np.float32)
+    rows[0, 0] = np.nan
+    mean, std = moments(rows, jnp.int32(1000))
+    np.testing.assert_array_equal(mean, rows[1])
+    np.testing.assert_array_equal(std, 1.0)
+
+
 @pytest.mark.parametrize("at", [0, 7])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_rows_that_are_not_finite_do_not_count(at, bad):
