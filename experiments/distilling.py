@@ -281,4 +281,5 @@ def _summary(rows: list[dict[str, Any]], names: Sequence[str], seconds: float) -
             share = f" ({mean / planner:.0%})" if planner > 0 else ""
             shown.append(f"{who} {mean:6.0f}{share}")
         lines.append(f"  {name:11} {'  '.join(shown)}")
+    lines += [f"  {line}" for line in records.not_finite(rows, names)]
     return "\n".join(lines)

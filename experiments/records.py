@@ -1,7 +1,7 @@
 """From arrays of trials to rows of the log, and to what a video is made of."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -147,7 +147,23 @@ def summary(
         own = [row["return"] for row in rows if row["task"] == task]
         each = " ".join(f"{value:.0f}" for value in own)
         lines.append(f"  {task:<{width}}{sum(own) / len(own):8.0f}   trials: {each}")
-    return "\n".join([*lines, *(f"  {line}" for line in _diverged(rows))])
+    also = [*_diverged(rows), *not_finite(rows, tasks)]
+    return "\n".join([*lines, *(f"  {line}" for line in also)])
+
+
+def not_finite(rows: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> list[str]:
+    """Returns what is to be said of tasks whose returns are no numbers, if any."""
+    lines = list[str]()
+    for task in tasks:
+        own = [row["return"] for row in rows if row["task"] == task]
+        lost = sum(not math.isfinite(value) for value in own)
+        if lost:
+            share = f"{lost} of {len(own)} trials"
+            lines.append(
+                f"the reward of {task} is not finite in {share}: a plan that expects "
+                "that is rejected"
+            )
+    return lines
 
 
 def _diverged(rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -101,6 +101,9 @@ def test_a_planner_that_earns_nothing_has_no_share():
     ]
     text = distilling._summary(rows, ["hop"], 1.0)
     assert "%" not in text and "policy      3" in text
+    rows[1]["return"] = np.nan
+    text = distilling._summary(rows, ["hop"], 1.0)
+    assert text.splitlines()[-1].startswith("  the reward of hop is not finite in 1 of")
 
 
 def test_a_task_is_seen_by_its_weights_or_as_one_of_several():

@@ -37,6 +37,17 @@ def test_a_task_counts_where_it_was_sought():
     assert describe(rows) == "value 2  returns:  forward 15  backward 7"
 
 
+def test_a_task_whose_reward_is_no_number_is_named():
+    rows = [
+        {"task": task, "return": value}
+        for task, value in (("log", np.nan), ("log", 2.0), ("run", 1.0), ("run", 3.0))
+    ]
+    *_, run, said = records.summary(rows, ["log", "run"], 1.0).splitlines()
+    assert run.split()[:2] == ["run", "2"]
+    assert said.startswith("  the reward of log is not finite in 1 of 2 trials")
+    assert "not finite" not in records.summary(rows[2:], ["run"], 1.0)
+
+
 def test_plans_without_a_finite_candidate_are_counted():
     """Every candidate of two steps of the second trial, at a horizon of 30."""
     values = np.ones((2, 3), np.float32)
