@@ -7,7 +7,6 @@ trials are the leading axes of every array.
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import jax
@@ -171,9 +170,7 @@ def zero_shot(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    begins = None
-    if config.policy:
-        begins = policy.of_file(Path(config.policy), robot, config.env, names)
+    begins = policy.of(config, robot)
     say_engines(run, parts.performed_by, refitter=parts.refitter)
     model = prepared(config, source, run, step, parts, tasks)
     placement = placed(run, len(config.seeds), len(names), config.eval_trials)

@@ -25,7 +25,7 @@ from jaxpets.policies import (
     to_onnx,
 )
 
-from . import critic, model_file
+from . import critic, model_file, robots
 from .build import Parts, imagined_end
 from .config import Config
 from .entries import to_json
@@ -96,6 +96,18 @@ class Policy(NamedTuple):
     networks: ActorCriticParams
 
 
+def of(config: Config, robot: Robot) -> Policy | None:
+    """Returns the policy that plans begin with, None if a config names none.
+
+    Raises:
+      RunError: as `of_file`.
+    """
+    if not config.policy:
+        return None
+    names = robots.names(config, robot)
+    return of_file(Path(config.policy), robot, config.env, names)
+
+
 def of_file(path: Path, robot: Robot, env: str, names: Sequence[str]) -> Policy:
     """Returns the policy in a file.
 
@@ -119,8 +131,8 @@ def of_file(path: Path, robot: Robot, env: str, names: Sequence[str]) -> Policy:
     except FileNotFoundError as error:
         valid = "there is no such file"
         raise UsageError(f"--policy {path} is not valid; {valid}.") from error
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(str(error)) from error
+    except (OSError, TypeError, ValueError) as error:
+        raise _refused(str(error)) from error
     found = Policy(planner, networks)
     task = jax.tree.map(lambda x: x[0], robot.tasks.params)
     try:
@@ -129,7 +141,7 @@ def of_file(path: Path, robot: Robot, env: str, names: Sequence[str]) -> Policy:
     except (TypeError, ValueError):  # of shapes that do not fit
         fits = False
     if not fits:
-        raise CheckpointError(f"{path} is a policy of another robot, or other tasks.")
+        raise _refused(f"{path} is a policy of another robot, or other tasks.")
     return found
 
 
@@ -142,14 +154,18 @@ def _check_about(
     """
     own, wanted = about.get("environment"), model_file.called(env)
     if own not in (None, wanted):
-        raise CheckpointError(f"{path} is a policy of {own}, not of {wanted}.")
+        raise _refused(f"{path} is a policy of {own}, not of {wanted}.")
     learned = about.get("tasks")
     if isinstance(learned, list) and not {*names} <= {*map(str, learned)}:
         said, performed = ", ".join(map(str, learned)), ", ".join(names)
-        raise CheckpointError(
+        raise _refused(
             f"{path} is a policy of other tasks: it was learned on {said}, and "
             f"{performed} are performed."
         )
+
+
+def _refused(why: str) -> CheckpointError:
+    return CheckpointError(f"--policy: {why}")
 
 
 def begun(parts: Parts, found: Policy) -> jaxpets.Planner:

@@ -103,6 +103,11 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / cli.variant(config, step)
     model = source.digest() if isinstance(source, ModelFile) else None
+    if config.policy:
+        from . import policy
+
+        # A folder that is made with a wrong one is refused to the corrected command.
+        policy.of(config, robots.of(config))
     with _opened(config, folder, model) as run:
         from . import distilling, phases
 

@@ -339,14 +339,20 @@ def test_a_plan_begins_with_a_policy(tmp_path):
 def test_a_policy_that_will_not_do_is_refused_before_work_begins(
     explored, tmp_path, capsys
 ):
+    """And before a folder is made, which would refuse the corrected command."""
+    other = tmp_path / "policy-0.onnx"
+    other.write_bytes(b"another format")
+    out = tmp_path / "out"
     for source, path, words in (
         ("best", "none.safetensors", "--policy none.safetensors is not valid"),
         ("best", "pretrained/bst", "best"),
+        ("best", str(other), "must be a safetensors file"),
         ("dmc/walker", "pretrained/best", "policy of pets/half_cheetah, not of dmc/wa"),
     ):
-        assert zero_shot(f"pretrained/{source}", tmp_path, "--policy", path) != 0
-        assert words in capsys.readouterr().err.splitlines()[-1]
-    assert not list(tmp_path.rglob("metrics.jsonl"))
+        assert zero_shot(f"pretrained/{source}", out, "--policy", path) != 0
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert words in last and last.startswith("error: --policy")
+    assert not list(tmp_path.rglob("metrics.jsonl")) and not out.exists()
     critic = ("--critic.num-updates", "9", "--policy", "pretrained/best")
     assert zero_shot(explored, tmp_path, *critic, "--tag", "both") == 2
     assert "None with a critic" in capsys.readouterr().err.splitlines()[-1]
