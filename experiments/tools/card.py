@@ -66,7 +66,7 @@ class _Performed(NamedTuple):
 class _Facts(NamedTuple):
     """What a card is made of."""
 
-    file: Path
+    file: Path  # as it is called, which may be somewhere else as yet
     about: Mapping[str, Any]  # what the file says
     model: jaxpets.Ensemble
     config: Config  # of the run
@@ -74,22 +74,26 @@ class _Facts(NamedTuple):
     performed: Sequence[_Performed]
 
 
-def text(file: Path, run: Path, returns: Sequence[Path] | None) -> str:
+def text(
+    file: Path, run: Path, returns: Sequence[Path] | None, name: Path | None = None
+) -> str:
     """Returns the card of a model.
 
     Args:
       file: from `experiments.tools.share`.
       run: the exploration that the model is of, or a zero-shot in it.
-      returns: folders of zero-shots with it; None for those in the run's folder.
+      returns: folders of zero-shots with it; None for those in the run's folder that
+        have a log.
+      name: of the file, where it is not there yet; None for what it is called now.
 
     Raises:
       RunError: if the file says nothing of a training, or a log or config is missing.
     """
-    facts = _facts(file, run, returns)
+    facts = _facts(file, run, returns)._replace(file=name or file)
     robot, arm = facts.about["environment"], facts.about["training"]["arm"]
     parts = (
         _front_matter(facts),
-        f"# {file.stem}: a model of {robot}",
+        f"# {facts.file.stem}: a model of {robot}",
         f"It predicts what {robot} does next, and was learned by the arm `{arm}` of "
         "jaxpets. It is no policy: a search plans with it, for any reward over what "
         "the robot observes.",
@@ -119,8 +123,9 @@ def _facts(file: Path, run: Path, returns: Sequence[Path] | None) -> _Facts:
     if config.phase != "explore":
         returns, run = returns or [run], run.parent
         config = exploration.config_of(RunFolder(run))
+    logged = (log.parent for log in run.glob(f"zero-shot-*/{rundir.METRICS}"))
     performed = []
-    for folder in sorted(run.glob("zero-shot-*")) if returns is None else returns:
+    for folder in sorted(logged) if returns is None else returns:
         rows = [r for r in _rows(folder) if (r.seed, r.explored) == (seed, trials)]
         if rows:
             device = _device(rundir.find_json(folder / rundir.ENVIRONMENT))
@@ -163,7 +168,8 @@ def _front_matter(facts: _Facts) -> str:
 
 def _usage(facts: _Facts) -> str:
     search = facts.about["search"]
-    shipped = [x for x in models.names() if models.path(x).samefile(facts.file)]
+    own = facts.file.resolve()
+    shipped = [x for x in models.names() if models.path(x).resolve() == own]
     settings = (f"{key}={value!r}" for key, value in search["settings"].items())
     return _USAGE.format(
         load=f'pretrained("{shipped[0]}")'

@@ -106,11 +106,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UsageError(
                 f"{page} is where the card goes; call the model otherwise."
             )
+        if args.file.is_dir():
+            raise UsageError(f"{args.file} is a folder; name a file in it.")
         with storage_errors(f"write {args.file}"):
             args.file.parent.mkdir(parents=True, exist_ok=True)
-            share(args.run, args.file, seed=args.seed, **options)
-        said = card.text(args.file, args.run, args.returns)
-        disk.write(page, said.encode())
+        # Neither is there without the other, whatever the card fails at.
+        with disk.replaced(args.file) as draft:
+            share(args.run, draft, seed=args.seed, **options)
+            said = card.text(draft, args.run, args.returns, args.file)
+            disk.write(page, said.encode())
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

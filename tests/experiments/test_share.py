@@ -69,6 +69,33 @@ def test_the_card_never_takes_the_place_of_the_model(explored, tmp_path, capsys)
     (tmp_path / "n.md").mkdir()
     assert share.main([str(explored), str(tmp_path / "n.safetensors")]) == 5
     assert f"cannot write {tmp_path / 'n.md'}" in capsys.readouterr().err
+    assert [x.name for x in tmp_path.iterdir()] == ["n.md"]
+
+
+def test_a_zero_shot_without_a_log_is_not_in_the_card(explored, tmp_path, capsys):
+    """As one that was stopped; where it is asked for, no model is written either."""
+    run, path = tmp_path / "run", tmp_path / "m.safetensors"
+    shutil.copytree(explored, run)
+    (run / "zero-shot-003").mkdir()
+    shutil.copy(run / "config.json", run / "zero-shot-003")
+    flags = (str(run), str(path))
+    assert share.main([*flags, "--returns", str(run / "zero-shot-003")]) == 2
+    log = run / "zero-shot-003" / "metrics.jsonl"
+    assert f"there is no {log}." in capsys.readouterr().err
+    assert [x.name for x in tmp_path.iterdir()] == ["run"]
+    assert share.main(flags) == 0
+    said = path.with_suffix(".md").read_text()
+    assert said.startswith("---") and "# m: a model of" in said
+    assert 'load_model("m.safetensors")' in said and "not performed a task yet" in said
+    assert {x.name for x in tmp_path.iterdir()} == {"run", path.name, "m.md"}
+
+
+def test_a_folder_is_no_file_of_a_model(explored, tmp_path, capsys):
+    folder = tmp_path / "models"
+    folder.mkdir()
+    assert share.main([str(explored), str(folder)]) == 2
+    assert f"{folder} is a folder; name a file in it." in capsys.readouterr().err
+    assert [x.name for x in tmp_path.iterdir()] == ["models"]
 
 
 def test_a_file_that_only_a_run_speaks_of_does_not_run(explored, tmp_path, capsys):
