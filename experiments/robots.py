@@ -158,6 +158,7 @@ def _trial(robot: "Robot", key: jax.Array) -> Any:
     state = jaxpets.start_trial(env, planner, key)
     nothing = jaxpets.PlanParams(())
     state, seen, _ = jaxpets.unroll(env, planner, nothing, key, state, length=1)
+    _check_end(env, seen.obs.shape[-1])
     features, target = space.features(seen.obs), space.target(seen.obs, seen.next_obs)
     known = (
         space.next_obs(seen.obs, target),
@@ -178,3 +179,18 @@ def _trial(robot: "Robot", key: jax.Array) -> Any:
         )
     shown = [seen.obs[:, axis.entry] for axis in robot.axes]
     return features, known, rewards, jnp.asarray(shown)
+
+
+def _check_end(env: jaxpets.Env, size: int) -> None:
+    """Refuses an end that knows one observation, where plans and scores have many."""
+    if env.terminal_fn is None:
+        return
+    # No two axes are of one size, so that none passes for another.
+    batch = (size + 1, size + 2)
+    ended = env.terminal_fn(jnp.zeros((*batch, size), jnp.float32))
+    found, kind = jnp.shape(ended), jnp.result_type(ended)
+    if found != batch or kind != jnp.bool_:
+        raise ValueError(
+            f"terminal_fn must be bool [...] for observations [..., D], got {kind} "
+            f"{found} for {(*batch, size)}"
+        )

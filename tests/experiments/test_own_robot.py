@@ -192,6 +192,30 @@ def test_a_file_that_is_no_robot_is_one_line(tmp_path, capsys, text):
     assert WRONG[text] in line and not out.exists()
 
 
+BAD_ENDS = {
+    "lambda o: o[1] < 0.1": "bool [...] for observations [..., D], got bool (6, 4) for",
+    "lambda o: o[..., 1]": "ValueError: env.terminal_fn must return bool[], got fl",
+    "lambda o: (o < 0.1).any()": "got bool () for (5, 6, 4)",
+    "lambda o: o @ o < 0.1": "4: TypeError: ",
+}
+
+
+@pytest.mark.parametrize("text", BAD_ENDS)
+def test_an_end_that_knows_one_observation_is_one_line(tmp_path, text):
+    """Plans and scores ask of many at once."""
+    made = "own = own_robot.robot(backend)"
+    lines = [f"import {own_robot.__name__}", "def robot(backend):", f"    {made}"]
+    lines += [f"    end = {text}", "    env = own.env._replace(terminal_fn=end)"]
+    file = tmp_path / "bad.py"
+    file.write_text("\n".join([*lines, "    return own._replace(env=env)"]))
+    with pytest.raises(UsageError) as error:
+        robots.named(str(file), "mujoco")
+    assert str(error.value).startswith(f"--env {file} is not valid; {file}:")
+    assert BAD_ENDS[text] in str(error.value)
+    file.write_text(file.read_text().replace(text, "lambda o: o[..., 1] < 0.1"))
+    assert robots.named(str(file), "mujoco").env.terminal_fn is not None
+
+
 BAD_TASKS = {
     "return {}": "rewards must have a task, got none",
     "return [1]": "it must return rewards by name, got list",
