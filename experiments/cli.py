@@ -174,7 +174,8 @@ def _explored(config: Config) -> Config:
     explored = from_json(data, preset_config(own.preset, own.arm, own.env), str(path))
     for entry in ("env", "arm"):
         said, found = getattr(config, entry), getattr(explored, entry)
-        user_files.check_named(flag(entry), said, found, path)
+        named = user_files.named(flag(entry), said, found, path)
+        explored = dataclasses.replace(explored, **{entry: named})
     return _numbers(explored)
 
 

@@ -24,6 +24,7 @@ from typing import (
 
 import msgspec
 
+from . import user_files
 from .config import Config, Mark, Run
 from .errors import CheckpointError
 
@@ -162,14 +163,17 @@ def from_json(data: Any, default: Config, where: str = "config.json") -> Config:
     return read(Config, data, default, refuse)
 
 
-def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
+def differences(
+    old: Any, new: Any, where: str = "config.json", run: Path | None = None
+) -> list[str]:
     """Returns where two configs in JSON are not of the same run: `entry: old vs new`.
 
     Which trial completes it may change, and what its phase does not read.
 
     An entry that `old` lacks, because an older version wrote it, was what is now the
     default. A group of entries that it lacks cannot differ. `where` is what an error
-    calls the file of `old`.
+    calls the file of `old`. A file of the user's may be called otherwise than in
+    `old`, from another folder, where `run` is the folder of the run.
 
     Raises:
       CheckpointError: if one of them cannot be read.
@@ -188,6 +192,7 @@ def differences(old: Any, new: Any, where: str = "config.json") -> list[str]:
         f"{name}: {to_json(pair[0])} (there) vs {to_json(pair[1])} (now)"
         for name, pair in sorted(pairs.items())
         if pair[0] != pair[1]
+        and not (run and user_files.is_same(pair[1], pair[0], run))
     ]
 
 

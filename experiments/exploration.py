@@ -43,10 +43,10 @@ def without_files(config: Config, env: str | None, run: Path) -> Config:
     Raises:
       UsageError: if the robot is of a file that it does not name, or another one.
     """
-    user_files.check_named("--env", env, config.env, run / rundir.CONFIG)
+    own = user_files.named("--env", env, config.env, run / rundir.CONFIG)
     valid = f"{config.env}, the robot of {run}"
-    require(env in (None, config.env), "--env", env, valid)
-    return dataclasses.replace(config, arm="random", tasks=None)
+    require(env in (None, own), "--env", env, valid)
+    return dataclasses.replace(config, env=own, arm="random", tasks=None)
 
 
 class Explored(NamedTuple):

@@ -151,7 +151,7 @@ def robot_of(model: Model, said: str, env: str | None) -> str:
     name = env or model.about.get("environment")
     if not isinstance(name, str):
         raise UsageError(f"--env is missing; {said} does not say of which robot it is.")
-    user_files.check_named("--env", env, name, model.path)
+    name = user_files.named("--env", env, name, model.path)
     if env is None and "/" not in name:  # all names of the library's have one
         own = f"{said} is of {name}, which is no robot of the library"
         raise UsageError(f"--env is missing; {own}. Name the file that makes it.")
@@ -265,8 +265,7 @@ def _arm_of(model: Model, given: str) -> str:
     except CheckpointError as error:
         words = f"{model.path} was explored by an arm of its own, {said!r}"
         raise UsageError(f"--arm is missing; {words}: name its file.") from error
-    user_files.check_named("--arm", given, arm, model.path)
-    return arm
+    return user_files.named("--arm", given, arm, model.path)
 
 
 def _sizes(model: Model, said: str) -> ModelConfig:

@@ -58,7 +58,8 @@ def _is_complete(folder: Path, config: Config, trial: int | None) -> bool:
     if not (folder / rundir.STATUS).is_file():
         return False
     began = rundir.find_json(folder / rundir.CONFIG)
-    if differences(began, to_json(config), str(folder / rundir.CONFIG)):
+    where = str(folder / rundir.CONFIG)
+    if differences(began, to_json(config), where, folder):
         return False  # the run itself refuses, and says what differs
     try:
         found = read(folder)

@@ -1,5 +1,6 @@
 """The command line: `python -m experiments.run {explore,zero-shot,...,report}`."""
 
+import functools
 import os
 import sys
 import traceback
@@ -134,9 +135,10 @@ def _opened(
     if config.phase == "finetune":
         branches *= len(robots.names(config, robots.of(config)))
     size = _NEEDED_BYTES * branches
+    differ = functools.partial(differences, run=path)
     with (
         signals.stoppable() as late,
-        folder.open_run(path, plain, differences, size, model) as run,
+        folder.open_run(path, plain, differ, size, model) as run,
         _plain_errors(config),
     ):
         if distributed.is_first() and not distributed.is_alone():

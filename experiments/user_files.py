@@ -42,8 +42,8 @@ def digests(texts: Iterable[str | None]) -> dict[str, str]:
     }
 
 
-def check_named(flag: str, said: str | None, found: str, where: Path) -> None:
-    """Refuses to run a file of which only the config of a run speaks.
+def named(flag: str, said: str | None, found: str, where: Path) -> str:
+    """Returns what to run of what the config of a run has: a file only as it is said.
 
     Args:
       flag: that would name it.
@@ -54,11 +54,44 @@ def check_named(flag: str, said: str | None, found: str, where: Path) -> None:
     Raises:
       UsageError: if that is a file, and another or none is said.
     """
-    if is_file(found) and said != found:
+    if not is_file(found):
+        return found
+    if said is None or not is_file(said):
         raise UsageError(
             f"{where} has {found}, a file, which runs only if you name it: "
             f"{flag} {found}."
         )
+    if not is_same(said, found, where.parent):
+        raise UsageError(
+            f"{flag} {said} is not valid; it must be the file that {where} has, {found}"
+            ", seen from here or from a folder that the run is in."
+        )
+    return said  # and never what the config says, which is another file from here
+
+
+def is_same(said: Any, found: Any, run: Path) -> bool:
+    """Returns whether a command line and a config name one function of one file.
+
+    A config does not say where its command was started. Most are in the folder of that,
+    or below it.
+
+    Args:
+      said: in the command line; files alone are compared by more than their text.
+      found: in the config.
+      run: the folder of the config.
+    """
+    if said == found:
+        return True
+    texts = [x for x in (said, found) if isinstance(x, str)]
+    forms = [form for x in texts if (form := _FORM.fullmatch(x))]
+    if len(forms) < 2 or forms[0][2] != forms[1][2]:
+        return False
+    own, its = (form[1] for form in forms)
+    folders = (Path(), run.resolve(), *run.resolve().parents)
+    try:
+        return any(_is_same(str(folder / its), own) for folder in folders)
+    except ValueError:  # of a stranger's text that names no file
+        return False
 
 
 def made(

@@ -9,7 +9,7 @@ import own_robot
 import pytest
 import runs
 
-from experiments import cli, robots
+from experiments import cli, robots, user_files
 from experiments.build import build
 from experiments.errors import UsageError
 from experiments.report import style
@@ -124,6 +124,72 @@ def test_a_file_runs_only_if_the_command_names_it(out, capsys, wanted):
     flags = [x for pair in (ROBOT, ARM) for x in pair if said >= {*pair}]
     assert main(["zero-shot", "--from", str(out / NAME), *flags]) == 2
     assert f"runs only if you name it: {' '.join(wanted)}." in capsys.readouterr().err
+
+
+def test_a_run_goes_on_from_another_folder(tmp_path, monkeypatch, capsys):
+    """With the file that the command names, though another is there of its old name."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    text = Path(FILE).read_text()
+    for name in ("cart.py", "other.py"):
+        (tmp_path / name).write_text(text)
+    (elsewhere / "cart.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    begin = ["explore", *TINY, "--arm", "random", "--num-trials"]
+    monkeypatch.chdir(tmp_path)
+    assert main([*begin, "1", "--env", "cart.py", "--name", "begun"]) == 0
+    monkeypatch.chdir(elsewhere)
+    again = ("--env", "../cart.py", "--name", "begun", "--out", "../runs")
+    assert main([*begin, "2", *again]) == 0
+    assert "warning" not in capsys.readouterr().err  # nor is a checkpoint set aside
+    rows = runs.rows(tmp_path / "runs/begun")
+    assert [row["trial"] for row in rows] == [1, 2]
+    perform = ["zero-shot", "--from", "../runs/begun", "--eval-trials", "1", "--env"]
+    assert main([*perform, "../cart.py"]) == 0
+    share_it = ("../runs/begun", "m.safetensors", "--env")
+    assert share.main([*share_it, "../cart.py"]) == 0
+    capsys.readouterr()
+    for line in (perform, share_it):
+        run = main if line is perform else share.main
+        assert run([*line, "../other.py"]) == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert "error: --env ../other.py is not valid; it must be the file" in said
+        assert "has, cart.py, seen from here or" in said
+        assert run([*line, "../cart.py:wrong"]) == 2
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    line = ["zero-shot", "--from", "runs/begun", "--eval-trials", "1"]
+    assert main([*line, "--env", "cart.py"]) == 0
+    assert "already complete" in capsys.readouterr().err
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "found"),
+    [
+        ("a/bot.py", "bot.py"),  # begun in a, where the run is
+        ("a/bot.py:two", "bot.py:two"),
+        ("link.py", "a/bot.py"),
+        ("b/../a/bot.py", "./a/bot.py"),
+        ("bot.py", "bot.py"),
+    ],
+)
+def test_one_file_has_several_names(tmp_path, monkeypatch, said, found):
+    """What runs is always what is said."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a/runs/mine", "b"):
+        Path(name).mkdir(parents=True)
+    Path("link.py").symlink_to("a/bot.py")
+    where = Path("a/runs/mine/config.json")
+    assert user_files.named("--env", said, found, where) == said
+    others = ("b/bot.py", "a/bot.py:other", "a/other.py", "b/bot.py:two")
+    for other in others:
+        with pytest.raises(UsageError, match=f"^--env {other} is not valid; it must"):
+            user_files.named("--env", other, found, where)
+    for other in (None, "dmc/walker"):
+        with pytest.raises(UsageError, match="runs only if you name it"):
+            user_files.named("--env", other, found, where)
+    with pytest.raises(UsageError, match="is not valid"):
+        user_files.named("--env", said, "\0.py", where)
 
 
 def test_a_file_that_was_changed_is_told(out, tmp_path, monkeypatch, capsys):
