@@ -6,7 +6,7 @@ performs, but there are no data to learn on.
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
@@ -22,6 +22,7 @@ from .entries import from_json, to_json
 from .errors import CheckpointError, UsageError
 from .presets import preset_config
 from .storage import rundir
+from .storage.identity import unlike
 
 if TYPE_CHECKING:  # it brings orbax, which wrong flags need not wait for
     from .storage.folder import RunFolder
@@ -174,16 +175,10 @@ def check_fits(model: Model, robot: Any, said: str) -> None:
         return
     why = f"it has observations and actions of {found}, and the robot of {wanted}"
     if found == wanted:
-        alone, lacking = _besides(own, its), _besides(its, own)
         why = "the coordinates must be the same in the same order; "
-        why += f"only the file has {alone}, only the robot has {lacking}"
+        why += unlike(own, its, "the file", lambda x: x.name)
     valid = f"{said} is of another robot: {why}"
     raise UsageError(f"--env {robot.name} is not valid; {valid}.")
-
-
-def _besides(rows: Sequence[Any], others: Sequence[Any]) -> str:
-    """Returns which coordinates there are besides others."""
-    return ", ".join(x.name for x in rows if x not in others) or "none"
 
 
 def search_of(model: Model, said: str) -> PlannerConfig:

@@ -136,9 +136,10 @@ def _opened(
         branches *= len(robots.names(config, robots.of(config)))
     size = _NEEDED_BYTES * branches
     differ = functools.partial(differences, run=path)
+    entries = [x.name for x in robots.of(config).env.coordinates]
     with (
         signals.stoppable() as late,
-        folder.open_run(path, plain, differ, size, model) as run,
+        folder.open_run(path, plain, differ, size, model, entries) as run,
         _plain_errors(config),
     ):
         if distributed.is_first() and not distributed.is_alone():

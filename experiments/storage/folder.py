@@ -250,7 +250,7 @@ class RunFolder(NamedTuple):
 @contextlib.contextmanager
 def open_run(
     path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
-    model: str | None = None,
+    model: str | None = None, entries: Sequence[str] = (),
 ) -> Iterator[RunFolder]:  # fmt: skip
     """Holds a run's folder for as long as the run lasts: locked, and accounted for.
 
@@ -260,14 +260,16 @@ def open_run(
       differences: says what of two configs differs and may not.
       needed_bytes: how much must be free there.
       model: digest of the file of a model that the run starts from, if it is one.
+      entries: names of what the robot observes, in order, if they have any.
 
     Raises:
-      CheckpointError: if the folder is in use, or of another config or model.
+      CheckpointError: if the folder is in use, or of another config, model or robot.
       StorageError: if it cannot be written to.
     """
     writer = Writer(path, config["phase"])
     tracked = Tracked(path, config)
-    held = _held(path, config, differences, needed_bytes, model, writer, tracked)
+    settle = partial(identity.settle, path, config, differences, model, entries)
+    held = _held(path, settle, needed_bytes, writer, tracked)
     with distributed.held_by_first(held):
         own = (writer, tracked) if distributed.is_first() else (None, None)
         yield RunFolder(path, tuple(config["milestones"]), config, differences, *own)
@@ -275,13 +277,13 @@ def open_run(
 
 @contextlib.contextmanager
 def _held(
-    path: Path, config: dict[str, Any], differences: Differences, needed_bytes: int,
-    model: str | None, writer: Writer, tracked: Tracked,
+    path: Path, settle: Callable[[], None], needed_bytes: int,
+    writer: Writer, tracked: Tracked,
 ) -> Iterator[None]:  # fmt: skip
     with rundir.lock(path):
         disk.sweep(path)
         rundir.probe(path, needed_bytes)
-        identity.settle(path, config, differences, model)
+        settle()
         for line in remember(path / rundir.ENVIRONMENT, environment()):
             distributed.say(f"warning: {line}")
         writer.begin()

@@ -3,13 +3,14 @@
 A folder gets a config and an id when it is made. Its checkpoints carry both, so that
 one which came from elsewhere is known, whatever its shapes are. The folder of what a
 file of a model performs knows the bytes of that file, as its name may soon be of
-another. Folders and checkpoints of older versions have none of this, and are taken as
-they are.
+another. The file of a robot may be edited, so that a folder knows what its robot
+observes, by name. Folders and checkpoints of older versions have none of this, and are
+taken as they are.
 """
 
 import os
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ _GOAL = "num_trials"  # which trial completes a run; not a part of which run it 
 
 def settle(
     path: Path, config: dict[str, Any], differences: Differences,
-    model: str | None = None,
+    model: str | None = None, entries: Sequence[str] = (),
 ) -> None:  # fmt: skip
     """Gives a new folder its config and its id; compares the config of an old one.
 
@@ -34,16 +35,19 @@ def settle(
       config: of now, in JSON.
       differences: between two configs.
       model: digest of the file of a model that the run starts from, if it is one.
+      entries: names of what the robot observes, in order, if they have any.
 
     Raises:
-      CheckpointError: if it is of other numbers, or of another model.
+      CheckpointError: if it is of other numbers, another model or another robot.
     """
     own = path / rundir.CONFIG
     _check_model(path, config, model)
+    _check_robot(path, config, entries)
     if not own.exists():
         known = (path / rundir.IDENTITY).exists()
         if not known and not checkpoint.steps(path / rundir.CHECKPOINTS):
-            made = {"id": secrets.token_hex(8), "model": model}
+            made: dict[str, Any] = {"id": secrets.token_hex(8), "model": model}
+            made |= {"entries": list(entries)} if entries else {}
             rundir.write_json(path / rundir.IDENTITY, made)
         rundir.write_json(own, config)
         return
@@ -69,6 +73,51 @@ def _check_model(path: Path, config: Mapping[str, Any], model: str | None) -> No
         f"{path} was started with another model than that of {now}: with that of "
         f"{then} at the time. Use another --tag or another --out."
     )
+
+
+def _check_robot(
+    path: Path, config: Mapping[str, Any], entries: Sequence[str]
+) -> None:  # fmt: skip
+    """Refuses another robot than that of a folder, or of the exploration it is in."""
+    explores = config["phase"] == "explore"
+    for folder in [path] if explores else [path.parent, path]:
+        known = rundir.find_json(folder / rundir.IDENTITY).get("entries")
+        if not isinstance(known, list) or known == list(entries) or not entries:
+            continue
+        why = unlike(known, entries, "the run")
+        another = "--name" if explores else "--tag"
+        advice = f"the same robot, or another {another}"
+        if folder != path:
+            advice = "the robot that explored, or explore again under another --name"
+        raise CheckpointError(
+            f"{folder} was started with another robot than --env {config['env']} is "
+            "now: its observations must have the same entries in the same order; "
+            f"{why}. Use {advice}."
+        )
+
+
+def unlike(
+    then: Sequence[Any], now: Sequence[Any], where: str,
+    name: Callable[[Any], str] = str,
+) -> str:  # fmt: skip
+    """Says how two rows of entries differ: what one alone has, or else the order.
+
+    Args:
+      then: entries of a run or a model.
+      now: those of the robot.
+      where: what the first are of, in words.
+      name: of an entry.
+    """
+    alone = [x for x in then if x not in now]
+    lacking = [x for x in now if x not in then]
+    pairs = enumerate(zip(then, now, strict=False))
+    moved = [(i, a, b) for i, (a, b) in pairs if a != b]
+    if alone or lacking or not moved:
+        own, its = (", ".join(map(name, x)) or "none" for x in (alone, lacking))
+        return f"only {where} has {own}, only the robot has {its}"
+    i, a, b = moved[0]
+    both = f"{name(a)} in {where}, {name(b)} in the robot"
+    return f"the order differs: entry {i} is {both}"
 
 
 def read_id(path: Path) -> str | None:

@@ -223,17 +223,21 @@ def test_a_model_in_other_coordinates_than_the_robots_is_refused(tmp_path, capsy
     robot = jaxpets.envs.make("pets/half_cheetah", backend="mujoco")
     path = tmp_path / "m.safetensors"
     for space, words in (
-        (jaxpets.delta_space(), "none, only the robot has mean_qvel/rootx, qpos/ro"),
+        (
+            jaxpets.delta_space(),
+            "only the file has none, only the robot has mean_qvel/rootx, qpos/rootz",
+        ),
         (
             coordinates.space(robot.space.coordinates[::-1]),
-            "none, only the robot has none",
+            "the order differs: entry 0 is qvel/ffoot in the file, mean_qvel/rootx in "
+            "the robot.",
         ),
     ):
         network(path, space)
         assert zero_shot(path, tmp_path / "out") == 2
         said = capsys.readouterr().err.splitlines()[-1]
         assert f"{path} is of another robot: the coordinates must be the" in said
-        assert f"only the file has {words}" in said
+        assert f"in the same order; {words}" in said
 
 
 def test_a_text_file_is_an_error(tmp_path, capsys):
