@@ -2,12 +2,14 @@
 
 import contextlib
 import functools
+import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxpets
 
@@ -96,6 +98,26 @@ def sizes(robot: "Robot") -> tuple[int, int]:
     """Returns D and A."""
     start = jax.eval_shape(robot.env.reset, jax.random.key(0))
     return start.obs.shape[0], robot.env.action_low.shape[0]
+
+
+def digests(config: Config) -> dict[str, str]:
+    """Returns what a user's robot is compiled to, in words, with a digest of it.
+
+    An MJCF, and the meshes that it names, may be edited while the file of the robot
+    stays as it is. A robot without a `model` is known by that file alone.
+    """
+    model = of(config).model if user_files.is_file(config.env) else None
+    if model is None:
+        return {}
+    import mujoco
+
+    c: Any = mujoco
+    if not isinstance(model, c.MjModel):
+        return {}
+    data = np.zeros((c.mj_sizeModel(model),), np.uint8)
+    c.mj_saveModel(model, None, data)
+    digest = hashlib.sha256(data.tobytes()).hexdigest()[:8]
+    return {f"the compiled model of {config.env}": digest}
 
 
 def chosen(config: Config, robot: "Robot") -> "Tasks":

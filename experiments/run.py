@@ -94,7 +94,7 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
     path = cli.explored_run(config)
     source: Source = ModelFile(path) if path.is_file() else RunFolder(path)
     if config.phase == "explore":
-        with _opened(config, source.path) as run:
+        with _opened(config, source.path, source) as run:
             from . import phases
 
             phases.explore(config, run, watch)
@@ -103,13 +103,12 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
         return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / cli.variant(config, step)
-    model = source.digest() if isinstance(source, ModelFile) else None
     if config.policy:
         from . import policy
 
         # A folder that is made with a wrong one is refused to the corrected command.
         policy.of(config, robots.of(config))
-    with _opened(config, folder, model) as run:
+    with _opened(config, folder, source) as run:
         from . import distilling, phases
 
         perform = {
@@ -125,12 +124,19 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
 
 @contextmanager
 def _opened(
-    config: Config, path: Path, model: str | None = None
-) -> Iterator["RunFolder"]:
-    """Holds the folder of a run that a signal may stop."""
-    from .storage import folder
+    config: Config, path: Path, source: Source
+) -> Iterator["RunFolder"]:  # fmt: skip
+    """Holds the folder of a run that a signal may stop.
+
+    Args:
+      config: of the run.
+      path: of its folder.
+      source: what it starts from; an exploration from itself.
+    """
+    from .storage import environment, folder, rundir
 
     plain = to_json(config)
+    model = source.digest() if isinstance(source, ModelFile) else None
     branches = len(config.seeds)
     if config.phase == "finetune":
         branches *= len(robots.names(config, robots.of(config)))
@@ -146,7 +152,12 @@ def _opened(
             late.seconds += 0.5  # the others first: jax aborts them when this one goes
         late.tell = run.interrupted
         files = (config.env, config.arm, config.tasks, config.policy)
-        for line in run.computes(**user_files.digests(files)):
+        made = user_files.digests(files) | robots.digests(config)
+        lines = run.computes(**made)
+        if not isinstance(source, ModelFile):
+            explored = source.find_json(rundir.ENVIRONMENT)
+            lines += environment.compare_environment(explored, made)
+        for line in dict.fromkeys(lines):
             run.say(f"warning: {line}; what was computed before is kept as it is")
         yield run
 

@@ -1,7 +1,10 @@
 """A robot of the user's that becomes another one between two commands."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import own_robot
@@ -90,3 +93,43 @@ def test_a_later_phase_goes_on_with_the_robot_that_it_began_with(here, capsys):
     assert main(["zero-shot", *LATER]) == 3
     assert "zero-shot-002 was started with another robot" in capsys.readouterr().err
     assert main(["zero-shot", *LATER, "--tag", "other"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("edited", "what"),
+    [
+        (("cart.xml", 'mass="1"', 'mass="1.5"'), "compiled model"),
+        (("cart.xml", 'range="-2 2"', 'range="-2 3"'), "compiled model"),
+        (("bug.py", "n[..., 1]", "n[..., 3]"), "content"),
+    ],
+)
+def test_a_robot_that_is_compiled_to_another_is_told(here, capsys, edited, what):
+    assert main(["zero-shot", *LATER, "--tag", "before"]) == 0
+    assert main([*EXPLORE, "--num-trials", "3"]) == 0
+    assert "warning" not in capsys.readouterr().err
+    edit(*edited)
+    for command in (
+        ("zero-shot", *LATER),  # new, so that only the exploration knows of the other
+        ("zero-shot", *LATER, "--at-trial", "2", "--tag", "before"),
+        (*EXPLORE, "--num-trials", "4"),
+    ):
+        assert main(command) == 0
+        said = capsys.readouterr().err.splitlines()
+        (line,) = [x for x in said if "warning" in x]
+        assert line.startswith(f"warning: the {what} of bug.py was ")
+
+
+def test_a_compiled_model_is_the_same_in_every_process(here):
+    """Its bytes hold nothing of the process that compiled it."""
+    known = json.loads((RUN / rundir.ENVIRONMENT).read_text())
+    code = (
+        "from experiments import robots, config; "
+        "print(robots.digests(config.Config(env='bug.py', engine='mujoco')))"
+    )
+    place = {**os.environ, "PYTHONPATH": str(Path(robots.__file__).parents[1])}
+    for seed in "12":
+        place["PYTHONHASHSEED"] = seed
+        line = [sys.executable, "-c", code]
+        said = subprocess.run(line, env=place, capture_output=True, check=True)
+        name = "the compiled model of bug.py"
+        assert said.stdout.decode().strip() == str({name: known[name]})
