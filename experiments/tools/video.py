@@ -180,6 +180,7 @@ def _render_here(args: argparse.Namespace) -> None:
     _check(args)
     obs = load_trial(args.npz, task=args.task, seed=args.seed, trial=args.trial)
     robot = _robot(args.env)
+    _check_size(args.npz, obs, robot, args.env)
     if args.fps is None:
         args.fps = min(round(1 / robot.step_time), _FPS_RANGE.stop - 1)
     look = Look(args.width, args.height, args.fps)
@@ -216,6 +217,20 @@ def _robot(env: str | None) -> "Robot":
     if robot.model is None or robot.qpos_fn is None:
         raise UsageError(f"--env {env} has no model that can be drawn.")
     return robot
+
+
+def _check_size(npz: Path, obs: np.ndarray, robot: "Robot", env: str | None) -> None:
+    """Refuses trajectories of another robot, of which entries would be missing."""
+    from .. import robots
+
+    found, (wanted, _) = obs.shape[-1], robots.sizes(robot)
+    if found != wanted:
+        said = f"--env {env} is not valid" if env else "--env is missing"
+        name = env or f"{robot.name}, which is drawn without it,"
+        raise UsageError(
+            f"{said}; {npz} has observations of {found} entries, and {name} has "
+            f"{wanted}. Name the robot that performed."
+        )
 
 
 def _opened(robot: "Robot", obs: np.ndarray, look: Look) -> tuple[Draw, np.ndarray]:

@@ -155,6 +155,29 @@ def test_bad_flags_exit_with_2_and_one_line(npz, tmp_path, flags, message):
     assert not target.exists()
 
 
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ([], "--env is missing; {} has observations of 21 entries, and pets/half_chee"),
+        (
+            ["--env", "pets/half_cheetah"],
+            "--env pets/half_cheetah is not valid; {} has",
+        ),
+    ],
+)
+def test_a_trial_of_another_robot_is_not_drawn(npz, tmp_path, env, message):
+    arrays = dict(np.load(npz))
+    arrays["obs"] = np.pad(arrays["obs"], [(0, 0)] * 4 + [(0, 3)])
+    np.savez(npz, **arrays)
+    which = ("--task", "forward", "--seed", "4", *env)
+    code, errors = command(npz, tmp_path / "a.mp4", *which)
+    assert code == 2
+    assert errors.startswith(f"error: {message.format(npz)}")
+    assert "has 18. Name the robot that performed." in errors
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "a.mp4").exists()
+
+
 def test_the_target_must_be_an_mp4(npz, tmp_path):
     code, errors = command(npz, tmp_path / "a.avi", "--task", "forward", "--seed", "4")
     assert code == 2
