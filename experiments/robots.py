@@ -189,6 +189,7 @@ def _trial(robot: "Robot", key: jax.Array) -> Any:
 
     def reward(task: Any) -> jax.Array:
         params = envs.with_constants(task, state.env.constants)
+        _check_indices(robot.tasks.reward_fn, params, seen)
         planned = jaxpets.rewards.score(robot.tasks.reward_fn, params, seen)
         return planned + robot.tasks.reward_fn(params, *seen)
 
@@ -216,3 +217,19 @@ def _check_end(env: jaxpets.Env, size: int) -> None:
             f"terminal_fn must be bool [...] for observations [..., D], got {kind} "
             f"{found} for {(*batch, size)}"
         )
+
+
+def _check_indices(reward_fn: Any, params: Any, seen: jaxpets.Transition) -> None:
+    """Refuses a reward that reads past the end, where JAX would read the last entry.
+
+    NumPy does not. A reward that cannot take its arrays is none the worse for it.
+    """
+    obs, action, next_obs = (np.zeros(x.shape[1:], np.float32) for x in seen)
+    with np.errstate(all="ignore"):
+        try:
+            reward_fn(params, obs, action, next_obs)
+        except IndexError as error:
+            if "out of bounds" in str(error):
+                raise
+        except Exception:  # what JAX can do and NumPy cannot
+            return

@@ -124,7 +124,12 @@ def tasks_of(rewards: Mapping[str, RewardFn]) -> Tasks:
             chosen, constants = params
         reward = jnp.zeros((), jnp.float32)
         for i, name in enumerate(names):
-            own: Any = rewards[name](constants, obs, action, next_obs)
+            try:
+                own: Any = rewards[name](constants, obs, action, next_obs)
+            except IndexError as error:
+                said = f"rewards[{name!r}] must read entries that there are: {error}"
+                # The line that reads is a line of the caller's, which is told of it.
+                raise IndexError(said).with_traceback(error.__traceback__) from error
             if own is None:
                 raise TypeError(f"rewards[{name!r}] must return a reward, got None.")
             reward = jnp.where(chosen == i, own, reward)

@@ -288,6 +288,10 @@ BAD_TASKS = {
     "return {'all': lambda c, o, a, n: n[..., 0]}": "names of their own, not all",
     "return {'a/b': lambda c, o, a, n: n[..., 0]}": "task 'a/b' is not a valid name",
     "return {'far': lambda c, o, a, n: n[..., 0] - c.goal}": "2: AttributeError: ",
+    "return {'past': lambda c, o, a, n: n[..., 4]}": "2: IndexError: rewards['past'] "
+    "must read entries that there are: index 4 is out of bounds for axis 0 with size 4",
+    "return {'past': lambda c, o, a, n: n[..., 0] * a[1]}": "2: IndexError: rewards['pa"
+    "st'] must read entries that there are: index 1 is out of bounds for axis 0 with",
     "return {'wide': lambda c, o, a, n: n}": "1: ValueError: reward_fn must return",
 }
 
@@ -300,6 +304,37 @@ def test_tasks_that_are_none_are_one_line(tmp_path, text):
         robots.named(FILE, "mujoco", str(file))
     assert str(error.value).startswith(f"--tasks {file} is not valid; {file}:")
     assert BAD_TASKS[text] in str(error.value)
+
+
+OWN_TASKS = [
+    "o.at[..., 0].set(1.0)[..., 0]",
+    "n.at[..., 9].get(mode='fill', fill_value=0.0)",
+    "n[..., jnp.arange(4)].sum(-1) / n[..., 0] + c['goal']",
+    "jax.lax.fori_loop(0, 4, lambda i, x: x + n[..., i], n[..., 0])",
+    "jnp.log(n[..., -4]) / o[..., 3] + a.sum()",
+]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("text", OWN_TASKS)
+def test_a_reward_of_jax_need_not_take_arrays_of_numpy(tmp_path, text):
+    file = tmp_path / "good.py"
+    file.write_text(
+        "import jax\nimport jax.numpy as jnp\n\ndef tasks():\n"
+        f"    return {{'good': lambda c, o, a, n: {text}}}"
+    )
+    assert robots.named(FILE, "mujoco", str(file)).tasks.names == ("good",)
+
+
+def test_a_robot_whose_own_reward_reads_past_the_end_is_one_line(tmp_path):
+    file = tmp_path / "bad.py"
+    text = Path(FILE).read_text()
+    assert text.count("next_obs[..., rate]") == 1
+    file.write_text(text.replace("next_obs[..., rate]", "next_obs[..., 40]"))
+    words = r"IndexError: rewards\['spin'\] must .* index 40 is out .* with size 4\.$"
+    with pytest.raises(UsageError, match=words) as error:
+        robots.named(str(file), "mujoco")
+    assert str(error.value).startswith(f"--env {file} is not valid; {file}:")
 
 
 BAD_ARMS = {
