@@ -10,13 +10,13 @@ import jax.numpy as jnp
 
 import jaxpets
 
-from . import user_files
+from . import robots, user_files
 from .build import EXPLORE, Parts, State, build, trial_keys
 from .config import Config
-from .entries import from_json
+from .entries import from_json, to_json
 from .errors import UsageError
 from .presets import PRESETS
-from .storage import rundir
+from .storage import identity, rundir
 from .storage.folder import RunFolder
 from .validate import require
 
@@ -42,11 +42,16 @@ def without_files(config: Config, env: str | None, run: Path) -> Config:
 
     Raises:
       UsageError: if the robot is of a file that it does not name, or another one.
+      CheckpointError: if the file has become that of another robot.
     """
     own = user_files.named("--env", env, config.env, run / rundir.CONFIG)
     valid = f"{config.env}, the robot of {run}"
     require(env in (None, own), "--env", env, valid)
-    return dataclasses.replace(config, env=own, arm="random", tasks=None)
+    config = dataclasses.replace(config, env=own, arm="random", tasks=None)
+    if user_files.is_file(own):  # which may have been edited since
+        names = [x.name for x in robots.of(config).env.coordinates]
+        identity.check_robot(run, to_json(config), names)
+    return config
 
 
 class Explored(NamedTuple):

@@ -42,7 +42,7 @@ def settle(
     """
     own = path / rundir.CONFIG
     _check_model(path, config, model)
-    _check_robot(path, config, entries)
+    check_robot(path, config, entries)
     if not own.exists():
         known = (path / rundir.IDENTITY).exists()
         if not known and not checkpoint.steps(path / rundir.CHECKPOINTS):
@@ -75,10 +75,14 @@ def _check_model(path: Path, config: Mapping[str, Any], model: str | None) -> No
     )
 
 
-def _check_robot(
+def check_robot(
     path: Path, config: Mapping[str, Any], entries: Sequence[str]
 ) -> None:  # fmt: skip
-    """Refuses another robot than that of a folder, or of the exploration it is in."""
+    """Refuses another robot than that of a folder, or of the exploration it is in.
+
+    Raises:
+      CheckpointError: if its entries are known to be others, or in another order.
+    """
     explores = config["phase"] == "explore"
     for folder in [path] if explores else [path.parent, path]:
         known = rundir.find_json(folder / rundir.IDENTITY).get("entries")

@@ -14,6 +14,7 @@ from test_own_robot import TINY
 from experiments import robots
 from experiments.run import main
 from experiments.storage import rundir
+from experiments.tools import model_error, share
 
 EXPLORE = ("explore", "--env", "bug.py", *TINY, "--out", "out")
 RUN = Path("out/smoke-bug-epistemic")
@@ -81,6 +82,16 @@ def test_a_robot_that_observes_something_else_is_refused(here, capsys, edited, w
         assert words in said
     assert [(RUN / name).read_text() for name in files] == before
     assert not list(RUN.glob("*/" + rundir.CONFIG))
+
+
+def test_a_model_is_not_read_with_another_robot(here, capsys):
+    """The file of a model would say entries that it has not learned."""
+    edit("bug.py", *SWAPPED)
+    assert share.main([str(RUN), "m.safetensors", "--env", "bug.py"]) == 3
+    assert model_error.main([str(RUN), "--env", "bug.py", "--out", "e.json"]) == 3
+    for line in capsys.readouterr().err.splitlines():
+        assert f"{RUN} was started with another robot than --env bug.py is now" in line
+    assert not Path("m.safetensors").exists() and not Path("e.json").exists()
 
 
 def test_a_later_phase_goes_on_with_the_robot_that_it_began_with(here, capsys):
