@@ -101,23 +101,26 @@ def sizes(robot: "Robot") -> tuple[int, int]:
 
 
 def digests(config: Config) -> dict[str, str]:
-    """Returns what a user's robot is compiled to, in words, with a digest of it.
+    """Returns a digest of what a user's robot is compiled to; nothing of another one.
 
     An MJCF, and the meshes that it names, may be edited while the file of the robot
-    stays as it is. A robot without a `model` is known by that file alone.
+    stays as it is, and that file while the robot does, as for a new task. Of a robot
+    without a `model` only its step and its actions are known.
     """
-    model = of(config).model if user_files.is_file(config.env) else None
-    if model is None:
+    if not user_files.is_file(config.env):
         return {}
-    import mujoco
+    robot = of(config)
+    bounds = (robot.env.action_low, robot.env.action_high)
+    data = repr((robot.step_time, *(np.asarray(x).tolist() for x in bounds))).encode()
+    if robot.model is not None:
+        import mujoco
 
-    c: Any = mujoco
-    if not isinstance(model, c.MjModel):
-        return {}
-    data = np.zeros((c.mj_sizeModel(model),), np.uint8)
-    c.mj_saveModel(model, None, data)
-    digest = hashlib.sha256(data.tobytes()).hexdigest()[:8]
-    return {f"the compiled model of {config.env}": digest}
+        c: Any = mujoco
+        if isinstance(robot.model, c.MjModel):
+            model = np.zeros((c.mj_sizeModel(robot.model),), np.uint8)
+            c.mj_saveModel(robot.model, None, model)
+            data += model.tobytes()
+    return {"the compiled robot": hashlib.sha256(data).hexdigest()[:8]}
 
 
 def chosen(config: Config, robot: "Robot") -> "Tasks":

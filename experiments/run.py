@@ -123,9 +123,7 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
 
 
 @contextmanager
-def _opened(
-    config: Config, path: Path, source: Source
-) -> Iterator["RunFolder"]:  # fmt: skip
+def _opened(config: Config, path: Path, source: Source) -> Iterator["RunFolder"]:
     """Holds the folder of a run that a signal may stop.
 
     Args:
@@ -152,11 +150,11 @@ def _opened(
             late.seconds += 0.5  # the others first: jax aborts them when this one goes
         late.tell = run.interrupted
         files = (config.env, config.arm, config.tasks, config.policy)
-        made = user_files.digests(files) | robots.digests(config)
-        lines = run.computes(**made)
+        robot = robots.digests(config)
+        lines = run.computes(**user_files.digests(files), **robot)
         if not isinstance(source, ModelFile):
             explored = source.find_json(rundir.ENVIRONMENT)
-            lines += environment.compare_environment(explored, made)
+            lines += environment.compare_environment(explored, robot)
         for line in dict.fromkeys(lines):
             run.say(f"warning: {line}; what was computed before is kept as it is")
         yield run

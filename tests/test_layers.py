@@ -89,7 +89,7 @@ LAYERS = {
     "_src.pretrained": 7,
     "_src.learner": 6,
     "_src.over_seeds": 7,
-    "_src.agent_world": 1,
+    "_src.agent_world": 3,
     "_src.agent_file": 7,
     "_src.agent_steps": 7,
     "_src.agent_call": 8,
