@@ -22,6 +22,7 @@ LAYERS = {
     "_src.types": 0,
     "_src.checks": 0,
     "_src.tensor_file": 0,
+    "_src.filled": 0,
     "_src.moments": 1,
     "_src.symlog": 1,
     "_src.elites": 1,

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.filled import filled
+
 
 class Batch(NamedTuple):
     """The rows of one update, a draw of its own for every member."""
@@ -28,7 +30,7 @@ def rows_shown(
 def shuffle(key: Array, rows: Array, size: Array) -> Array:
     """Returns the rows `[E, C]` in another order; the first `size` stay the first."""
     order = jax.random.uniform(key, rows.shape, jnp.float32)
-    order = jnp.where(jnp.arange(rows.shape[1], dtype=jnp.int32) < size, order, jnp.inf)
+    order = jnp.where(filled(rows.shape[1], size), order, jnp.inf)
     return jnp.take_along_axis(rows, jnp.argsort(order, axis=1), axis=1)
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_record
+from jaxpets._src.filled import filled
 from jaxpets._src.moments import moments
 from jaxpets._src.types import Dataset, Transition
 
@@ -68,8 +69,7 @@ def append(
             raise TypeError(f"count must be int32[], got {count!r}.")
         added = jnp.clip(count, 0, length).astype(jnp.int32)
         # Beyond the last row nothing is written.
-        row = jnp.arange(length, dtype=jnp.int32)
-        rows = jnp.where(row < added, rows, capacity)
+        rows = jnp.where(filled(length, added), rows, capacity)
     data = Transition(
         *(
             jnp.asarray(old).at[rows].set(new)

@@ -126,9 +126,8 @@ def random_network_distillation(
 
         def update(i: Array, fit: tuple[Layers, Any]) -> tuple[Layers, Any]:
             predictor, opt_state = fit
-            batch = i % num_batches + num_batches * jnp.arange(
-                batch_size, dtype=jnp.int32
-            )
+            number = jnp.arange(batch_size, dtype=jnp.int32)
+            batch = i % num_batches + num_batches * number
             shown = jnp.take(inputs, batch, axis=0, mode="clip")
             counts = jnp.take(weight, batch, mode="fill", fill_value=0.0)
             grad_fn = cast(Callable[..., Any], jax.grad(_loss))

@@ -23,6 +23,7 @@ from jaxpets._src.ensemble_params import (
     Scaler,
     imagined_range,
 )
+from jaxpets._src.filled import filled
 from jaxpets._src.moments import moments
 from jaxpets._src.network import Network
 from jaxpets._src.types import DynamicsFn, ModelSpace, Transition
@@ -259,9 +260,7 @@ def params_check(
 def _observed_range(data: Transition, size: Array) -> tuple[Array, Array]:
     """Returns the least and greatest observation `[D]` in the first `size` rows."""
     obs = jnp.stack([data.obs, data.next_obs])
-    used = (jnp.arange(obs.shape[1], dtype=jnp.int32) < size)[:, None] & jnp.isfinite(
-        obs
-    )
+    used = filled(obs.shape[1], size)[:, None] & jnp.isfinite(obs)
     low = jnp.min(jnp.where(used, obs, jnp.inf), axis=(0, 1))
     high = jnp.max(jnp.where(used, obs, -jnp.inf), axis=(0, 1))
     # Without data there is no range to keep to.

@@ -13,6 +13,7 @@ from jaxpets._src.checks import (
     check_key,
     check_record,
 )
+from jaxpets._src.filled import filled
 from jaxpets._src.returns import of_particles, single_reward
 from jaxpets._src.types import (
     Dataset,
@@ -163,9 +164,7 @@ def reward_range(
 
     capacity = dataset.data.obs.shape[0]
     rewards = jax.vmap(of_row)(jax.random.split(key, capacity), dataset.data)
-    used = (jnp.arange(capacity, dtype=jnp.int32) < dataset.size) & jnp.isfinite(
-        rewards
-    )
+    used = filled(capacity, dataset.size) & jnp.isfinite(rewards)
     rewards = jnp.where(used, rewards, 0.0)
     return jnp.minimum(jnp.min(rewards), 0.0), jnp.maximum(jnp.max(rewards), 0.0)
 

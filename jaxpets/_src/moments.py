@@ -3,14 +3,15 @@
 import jax.numpy as jnp
 from jax import Array
 
+from jaxpets._src.filled import filled
+
 # A constant column is not divided by its rounding noise. PETS: 1e-12, in float64.
 _MIN_STD = 1e-6
 
 
 def counted(rows: Array, size: Array) -> Array:
     """Returns which rows of `[C, F]` count, `[C]`: the first `size`, if finite."""
-    number = jnp.arange(rows.shape[0], dtype=jnp.int32)
-    return (number < size) & jnp.all(jnp.isfinite(rows), axis=1)
+    return filled(rows.shape[0], size) & jnp.all(jnp.isfinite(rows), axis=1)
 
 
 def moments(rows: Array, size: Array) -> tuple[Array, Array]:

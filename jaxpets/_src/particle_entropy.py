@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxpets._src.checks import check_array, check_count, check_record
+from jaxpets._src.filled import filled
 from jaxpets._src.moments import moments
 from jaxpets._src.types import Dataset, RewardFn
 
@@ -91,7 +92,7 @@ def particle_entropy(num_neighbors: int = 12) -> RewardFn:
         square = jnp.where(params.used, square, jnp.inf)
         nearest, _ = jax.lax.top_k(-square, num_neighbors)
         count = jnp.minimum(jnp.sum(params.used), num_neighbors)
-        found = jnp.arange(num_neighbors, dtype=jnp.int32) < count
+        found = filled(num_neighbors, count)
         total = jnp.sum(jnp.where(found, jnp.sqrt(-nearest), 0.0), axis=-1)
         entropy = jnp.log1p(total / jnp.maximum(count, 1).astype(jnp.float32))
         # Of no neighbours the sum would be 0, whatever there is to compare.

@@ -53,36 +53,28 @@ def test_a_number_of_numpy_becomes_one_of_python(value):
 
 
 @pytest.mark.parametrize(
-    ("config", "name"),
+    ("config", "name", "number"),
     [
-        (jaxpets.EnsembleConfig, "bound_decay"),
-        (jaxpets.EnsembleConfig, "state_margin"),
-        (jaxpets.EnsembleConfig, "weight_decays"),
-        (jaxpets.FitConfig, "final_rate"),
-        (policies.ActorCriticConfig, "trace"),
-        (policies.ActorCriticConfig, "noise"),
-        (policies.DistillConfig, "planned"),
-        (policies.DistillConfig, "noise"),
-        (policies.DistillConfig, "restart"),
+        (jaxpets.EnsembleConfig, "bound_decay", np.float64(0.5)),
+        (jaxpets.EnsembleConfig, "state_margin", np.float64(0.5)),
+        (jaxpets.EnsembleConfig, "weight_decays", np.float64(0.5)),
+        (jaxpets.FitConfig, "final_rate", np.float64(0.5)),
+        (policies.ActorCriticConfig, "trace", np.float64(0.5)),
+        (policies.ActorCriticConfig, "noise", np.float64(0.5)),
+        (policies.DistillConfig, "planned", np.float64(0.5)),
+        (policies.DistillConfig, "noise", np.float64(0.5)),
+        (policies.DistillConfig, "restart", np.float64(0.5)),
+        (jaxpets.EnsembleConfig, "num_members", np.uint8(8)),
+        (jaxpets.FitConfig, "num_epochs", np.uint8(8)),
+        (jaxpets.FitConfig, "batch_size", np.uint8(8)),
+        (policies.ActorCriticConfig, "batch_size", np.uint8(8)),
+        (policies.DistillConfig, "num_trials", np.uint8(8)),
     ],
 )
-def test_a_config_keeps_numbers_of_python(config, name):
-    """Those of NumPy make float64 of what they meet under x64."""
-    assert type(getattr(config(**{name: np.float64(0.5)}), name)) is float
-
-
-@pytest.mark.parametrize(
-    ("config", "name"),
-    [
-        (jaxpets.EnsembleConfig, "num_members"),
-        (jaxpets.FitConfig, "num_epochs"),
-        (jaxpets.FitConfig, "batch_size"),
-        (policies.ActorCriticConfig, "batch_size"),
-        (policies.DistillConfig, "num_trials"),
-    ],
-)
-def test_a_config_keeps_integers_of_python(config, name):
-    assert type(getattr(config(**{name: np.uint8(8)}), name)) is int
+def test_a_config_keeps_numbers_of_python(config, name, number):
+    """Those of NumPy make float64 of what they meet under x64, and overflow."""
+    kind = int if isinstance(number, np.integer) else float
+    assert type(getattr(config(**{name: number}), name)) is kind
 
 
 def test_a_search_of_small_integers_of_numpy_does_not_overflow():
