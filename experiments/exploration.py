@@ -49,8 +49,7 @@ def without_files(config: Config, env: str | None, run: Path) -> Config:
     require(env in (None, own), "--env", env, valid)
     config = dataclasses.replace(config, env=own, arm="random", tasks=None)
     if user_files.is_file(own):  # which may have been edited since
-        names = [x.name for x in robots.of(config).env.coordinates]
-        identity.check_robot(run, to_json(config), names)
+        identity.check_robot(run, to_json(config), robots.entries(config))
     return config
 
 

@@ -157,11 +157,13 @@ def explore(config: Config, run: RunFolder, watch: Watch) -> None:
 
 
 def zero_shot(
-    config: Config, source: Source, run: RunFolder, step: int, watch: Watch
-) -> None:
+    config: Config, source: Source, run: RunFolder, step: int, watch: Watch,
+    begins: policy.Policy | None = None,
+) -> None:  # fmt: skip
     """Phase 2, at first: tasks planned with the explored model, nothing learned.
 
-    The jump-start of Table 1. The model that acts is saved beside its log.
+    The jump-start of Table 1. The model that acts is saved beside its log. Plans begin
+    with what a policy would do, if there is one.
     """
     robot = robots.of(config)
     tasks = robots.chosen(config, robot)
@@ -170,7 +172,6 @@ def zero_shot(
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
-    begins = policy.of(config, robot)
     say_engines(run, parts.performed_by, refitter=parts.refitter)
     model = prepared(config, source, run, step, parts, tasks)
     placement = placed(run, len(config.seeds), len(names), config.eval_trials)

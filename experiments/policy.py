@@ -25,7 +25,7 @@ from jaxpets.policies import (
     to_onnx,
 )
 
-from . import critic, model_file, robots
+from . import critic, model_file
 from .build import Parts, imagined_end
 from .config import Config
 from .entries import to_json
@@ -94,18 +94,6 @@ class Policy(NamedTuple):
 
     planner: jaxpets.Planner
     networks: ActorCriticParams
-
-
-def of(config: Config, robot: Robot) -> Policy | None:
-    """Returns the policy that plans begin with, None if a config names none.
-
-    Raises:
-      RunError: as `of_file`.
-    """
-    if not config.policy:
-        return None
-    names = robots.names(config, robot)
-    return of_file(Path(config.policy), robot, config.env, names)
 
 
 def of_file(path: Path, robot: Robot, env: str, names: Sequence[str]) -> Policy:

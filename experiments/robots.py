@@ -100,6 +100,11 @@ def sizes(robot: "Robot") -> tuple[int, int]:
     return start.obs.shape[0], robot.env.action_low.shape[0]
 
 
+def entries(config: Config) -> list[str]:
+    """Returns the names of what the robot observes, in order; none if it has none."""
+    return [x.name for x in of(config).env.coordinates]
+
+
 def digests(config: Config) -> dict[str, str]:
     """Returns a digest of what a user's robot is compiled to; nothing of another one.
 
@@ -235,4 +240,4 @@ def _check_indices(reward_fn: Any, params: Any, seen: jaxpets.Transition) -> Non
             if "out of bounds" in str(error):
                 raise
         except Exception:  # what JAX can do and NumPy cannot
-            return
+            pass

@@ -103,16 +103,19 @@ def _run(config: Config, with_gl: Callable[[], None], watch: Watch) -> None:
         return
     step = _explored_step(config, source)
     folder = cli.results_folder(config) / cli.variant(config, step)
+    begins = None
     if config.policy:
         from . import policy
 
         # A folder that is made with a wrong one is refused to the corrected command.
-        policy.of(config, robots.of(config))
+        robot = robots.of(config)
+        names = robots.names(config, robot)
+        begins = policy.of_file(Path(config.policy), robot, config.env, names)
     with _opened(config, folder, source) as run:
         from . import distilling, phases
 
         perform = {
-            "zero-shot": phases.zero_shot,
+            "zero-shot": functools.partial(phases.zero_shot, begins=begins),
             "finetune": phases.finetune,
             "distill": distilling.distill,
         }[config.phase]
@@ -140,7 +143,7 @@ def _opened(config: Config, path: Path, source: Source) -> Iterator["RunFolder"]
         branches *= len(robots.names(config, robots.of(config)))
     size = _NEEDED_BYTES * branches
     differ = functools.partial(differences, run=path)
-    entries = [x.name for x in robots.of(config).env.coordinates]
+    entries = robots.entries(config)
     with (
         signals.stoppable() as late,
         folder.open_run(path, plain, differ, size, model, entries) as run,

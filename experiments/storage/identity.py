@@ -75,9 +75,7 @@ def _check_model(path: Path, config: Mapping[str, Any], model: str | None) -> No
     )
 
 
-def check_robot(
-    path: Path, config: Mapping[str, Any], entries: Sequence[str]
-) -> None:  # fmt: skip
+def check_robot(path: Path, config: Mapping[str, Any], entries: Sequence[str]) -> None:
     """Refuses another robot than that of a folder, or of the exploration it is in.
 
     Raises:
