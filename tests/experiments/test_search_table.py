@@ -103,34 +103,63 @@ def test_the_smallest_search_that_is_good_enough(searches):
 def test_every_search_of_a_millisecond_is_in_the_text():
     page = (RESULTS / "README.md").read_text()
     (text,) = re.findall(r"### Searches of a millisecond\n(.*?)\n#", page, re.DOTALL)
-    found, returns = logged("real-time/100-101-102-103-104")
-    full = returns.pop("full")
-    assert np.array_equal(full.round(), [6326, 6046, 9594, 9055])
-    assert len(returns) == len(re.findall(r"\*\*\d+\*\*", text)) == 22
-    columns = {500: 1, 1000: 2, 1600: 3}
-    for name, search in found.items():
-        if name == "full":
-            continue
-        share = shown_as(100 * returns[name] / full)
-        if not search["means"]:
-            assert share in text
-            continue
-        column = columns[search["num_samples"]]
-        rows = [x.split("|") for x in text.splitlines() if x.count("|") == 5]
-        assert share in [row[column + 1].strip() for row in rows], name
-
-
-def test_the_searches_that_were_chosen_for_a_millisecond():
-    page = (RESULTS / "README.md").read_text()
-    assert "94 ± 3, 97 ± 2, 98 ± 4 and 99 ± 2" in page
-    assert "97 ±\n  9, 100 ± 3, 98 ± 5 and 99 ± 4" in page
-    for name, expected in (
-        ("means-1000-3-12", [94, 97, 98, 99]),
-        ("means-1600-3-12", [97, 100, 98, 99]),
+    shown = 0
+    for run, full_returns, columns in (
+        (
+            "real-time/100-101-102-103-104",
+            [6326, 6046, 9594, 9055],
+            {(500, 30): 1, (1000, 30): 2, (1600, 30): 3},
+        ),
+        (
+            "real-time-again/110-111-112-113-114",
+            [6531, 5888, 10977, 8989],
+            {(1000, 30): 1, (1600, 30): 2, (1600, 27): 3},
+        ),
     ):
-        total = {"full": 0.0, name: 0.0}
-        for seeds in ("100-101-102-103-104", "105-106-107-108-109"):
-            _, returns = logged(f"real-time/{seeds}")
-            total = {x: total[x] + returns[x] for x in total}
-        shares = 100 * total[name] / total["full"]
-        assert np.array_equal(shares.round(), expected)
+        found, returns = logged(run)
+        full = returns.pop("full")
+        assert np.array_equal(full.round(), full_returns)
+        shown += len(returns)
+        for name in returns:
+            search, share = found[name], shown_as(100 * returns[name] / full)
+            if not search["means"]:
+                assert share in text
+                continue
+            size, horizon = search["num_samples"], search["horizon"]
+            column = columns[size, horizon if (size, horizon) in columns else 30]
+            rows = [x.split("|") for x in text.splitlines() if x.count("|") == 5]
+            assert share in [row[column + 1].strip() for row in rows], name
+    assert shown == len(re.findall(r", \*\*\d+\*\*", text)) == 22 + 12
+
+
+@pytest.mark.parametrize(
+    ("before", "again", "seeds", "shares"),
+    [
+        ("means-1000-3-12", None, 110, "94 ± 3, 97 ± 2, 98 ± 4 and 99 ± 2"),
+        ("means-1600-3-12", None, 110, "97 ± 9, 100 ± 3, 98 ± 5 and 99 ± 4"),
+        (None, "1000-12-0.5", 120, "97 ± 5, 101 ± 4, 97 ± 2 and 100 ± 4"),
+        (None, "1600-27-12-0.5", 120, "97 ± 6, 106 ± 4, 97 ± 3 and 104 ± 3"),
+        ("means-1000-3-12", "1000-12-0.5", 120, "95 ± 3, 99 ± 2, 98 ± 2 and 100 ± 2"),
+        (
+            "means-1600-3-12",
+            "1600-30-12-0.5",
+            115,
+            "96 ± 6, 102 ± 3, 98 ± 3 and 99 ± 3",
+        ),
+    ],
+)
+def test_the_shares_of_what_was_chosen_for_a_millisecond(before, again, seeds, shares):
+    """Of the models of two sweeps, up to a seed."""
+    page = (RESULTS / "README.md").read_text()
+    assert shares in " ".join(page.split())
+    of_full, searched = np.zeros(4), np.zeros(4)
+    for first in range(100, seeds, 5):
+        sweep, name = (
+            ("real-time", before) if first < 110 else ("real-time-again", again)
+        )
+        if name is not None:
+            five = "-".join(str(x) for x in range(first, first + 5))
+            _, returns = logged(f"{sweep}/{five}")
+            of_full, searched = of_full + returns["full"], searched + returns[name]
+    expected = [int(x) for x in re.findall(r"(\d+) ±", shares)]
+    assert np.array_equal((100 * searched / of_full).round(), expected)
