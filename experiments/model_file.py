@@ -181,13 +181,21 @@ def check_fits(model: Model, robot: Any, said: str) -> None:
     raise UsageError(f"--env {robot.name} is not valid; {valid}.")
 
 
-def search_of(model: Model, said: str) -> PlannerConfig:
+def search_of(model: Model, said: str, default: PlannerConfig) -> PlannerConfig:
     """Returns the search that a file says is good for its model.
 
+    Args:
+      model: of the file.
+      said: what the user called it.
+      default: where it says none, with as many particles as there are members.
+
     Raises:
-      CheckpointError: if it is none, or one with numbers beyond reason.
+      CheckpointError: if what it says is none, or has numbers beyond reason.
     """
-    search = model.about.get("search")
+    if "search" not in model.about:
+        members = model.ensemble.num_members
+        return dataclasses.replace(default, num_particles=members)
+    search = model.about["search"]
     try:
         if not isinstance(search, dict):
             raise TypeError("it says no search")
@@ -224,10 +232,7 @@ def config_of(path: Path, config: Config) -> Config:
     if length := given.get("trial_length"):
         given["task_length"] = length
     default, sizes = preset_config("laptop", arm, env), _sizes(model, said)
-    members = sizes.num_members
-    search = dataclasses.replace(default.task_planner, num_particles=members)
-    if "search" in model.about:
-        search = search_of(model, said)
+    search = search_of(model, said, default.task_planner)
     own_config = dataclasses.replace(
         from_json(given, default, said),
         engine="mujoco",

@@ -59,9 +59,9 @@ def serve(
     token = secrets.token_urlsafe(16) if options.host else ""
     listener, address = _opened(options)
     with serving(listener, token) as server:
-        tell(f"{address}{token}/" if token else address)
         make = _live if options.watch is None else _watching
         session, page = make(server, options)
+        tell(f"{address}{token}/" if token else address)
         world = threading.Thread(target=session.run, args=(page.steer,), daemon=True)
         world.start()
         page.run(is_over.wait, rate)

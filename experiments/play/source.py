@@ -9,9 +9,9 @@ from jaxpets import policies
 from jaxpets.envs import Robot
 
 from .. import build, exploration, model_file, robots
-from ..config import PlannerConfig
+from ..config import Config, PlannerConfig
 from ..errors import UsageError
-from ..presets import quick_search
+from ..presets import preset_config, quick_search
 
 
 class Source(NamedTuple):
@@ -63,7 +63,8 @@ def _of_file(path: Path, said: str, env: str | None) -> Source:
     model_file.check_fits(model, robot, said)
     config = model.ensemble.config
     assert config is not None
-    search = model_file.search_of(model, said)
+    default = preset_config("laptop", Config().arm, name).task_planner
+    search = model_file.search_of(model, said, default)
     own = None
     # A robot of the user's own may have other tasks than the model's.
     if path != Path(said) and name == model.about.get("environment"):

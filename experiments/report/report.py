@@ -9,7 +9,7 @@ import numpy as np
 
 from ..config import UNPLANNED
 from ..errors import UsageError
-from ..storage import disk
+from ..storage import disk, rundir
 from . import (
     caveats,
     coverage,
@@ -57,7 +57,8 @@ def write_report(out: Path, target: Path) -> list[Path]:
 
     With logs of several presets or robots each has files of its own: `paper` (or else
     the first) under these names, the others with the preset, and with the robot if that
-    is not the paper's, in the name.
+    is not the paper's, in the name. What models of files did is the preset `models`,
+    the last.
 
     Args:
       out: holds runs at any depth, and model_error.json if there is one.
@@ -72,11 +73,9 @@ def write_report(out: Path, target: Path) -> list[Path]:
     rows = load(out)
     seen = coverage.load(out)
     target.mkdir(parents=True, exist_ok=True)
-    presets = {row.preset for row in rows}
+    presets = sorted({row.preset for row in rows}, key=_place)
     written: list[Path] = []
-    for i, preset in enumerate(
-        sorted(presets, key=lambda name: (name != "paper", name))
-    ):
+    for i, preset in enumerate(presets):
         suffix = f"-{preset}" if i else ""
         files = _Files(
             report=target / f"report{suffix}.md",
@@ -93,6 +92,11 @@ def write_report(out: Path, target: Path) -> list[Path]:
         _write(own, covered, out, files)
         written += [file for file in files if file.exists()]
     return written
+
+
+def _place(preset: str) -> tuple[bool, bool, str]:
+    """Returns the place of a preset among others: `paper` first, `models` last."""
+    return preset != "paper", preset.partition("-")[0] == rundir.MODELS, preset
 
 
 def _write(rows: Sequence[Row], covered: Seen | None, out: Path, files: _Files) -> None:

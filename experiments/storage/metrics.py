@@ -43,7 +43,7 @@ _RENAMED = {"loss": "nll"}
 class Row(NamedTuple):
     """A line of a log, with what its run says about it."""
 
-    preset: str  # with the robot, as `rundir.study` has it
+    preset: str  # with the robot, as `rundir.study_of` has it
     arm: str  # with the number of bits for count: count-32
     phase: str
     seed: int
@@ -118,24 +118,25 @@ def read(log: Path, config: Mapping[str, Any]) -> Iterator[Row]:
     A last line without its end is left out: a run is writing it, or was killed while it
     did. So is a line that is no row, and that is said.
     """
+    study = rundir.study_of(log.parent, config)
     with log.open("rb") as file:
         for i, line in enumerate(file, 1):
             if not line.endswith(b"\n"):
                 return
             try:
-                yield _parsed(_checked(line), config, log.parent)
+                yield _parsed(_checked(line), config, log.parent, study)
             except (ValueError, RecursionError) as error:
                 why = f"{log}:{i} is no row of a run ({error})"
                 distributed.say(f"warning: {why}; left out.")
 
 
-def _parsed(data: Any, config: Mapping[str, Any], run: Path) -> Row:
+def _parsed(data: Any, config: Mapping[str, Any], run: Path, study: str) -> Row:
     line = msgspec.convert(data, _Explore | _ZeroShot | _Finetune | _Distill)
     if fit := data.get("fit"):
         fit = {_RENAMED.get(name, name): value for name, value in fit.items()}
         data = data | {"fit": fit}
     return Row(
-        preset=rundir.study(config),
+        preset=study,
         arm=arm_label(line.arm, config),
         phase=data["phase"],
         seed=line.seed,

@@ -39,6 +39,7 @@ TRAJECTORIES = "trajectories.npz"
 # What can only be one file or folder below another.
 Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 _MAX_JSON_BYTES = 1_000_000
+MODELS = "models"  # in the place of a preset
 HALF_CHEETAH = "pets/half_cheetah"  # the robot of the paper, which no name mentions
 
 
@@ -66,6 +67,15 @@ def study(config: Mapping[str, Any]) -> str:
     env = config.get("env", HALF_CHEETAH)
     robot = [] if env == HALF_CHEETAH else [label(env)]
     return "-".join([config["preset"], *robot])
+
+
+def study_of(run_dir: Path, config: Mapping[str, Any]) -> str:
+    """Returns the study of a run: of what a file's model does the preset is `models`.
+
+    How such a model explored is none of the presets that are here.
+    """
+    is_file = find_json(run_dir / IDENTITY).get("model") is not None
+    return study({**config, "preset": MODELS} if is_file else config)
 
 
 def check_name(name: str) -> None:

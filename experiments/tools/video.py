@@ -12,6 +12,7 @@ import logging
 import math
 import os
 import sys
+import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -105,7 +106,10 @@ def write_mp4(target: Path, pictures: Iterator[np.ndarray], look: Look) -> None:
     writer = imageio_ffmpeg.write_frames(
         str(target), size, fps=look.fps, macro_block_size=2, ffmpeg_log_level="error"
     )
-    writer.send(None)
+    with warnings.catch_warnings():
+        # JAX warns of any fork; this one becomes ffmpeg at once.
+        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+        writer.send(None)
     try:
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture))

@@ -41,15 +41,14 @@ def test_a_guide_shows_lines_of_examples_or_what_is_run_here(guide):
     assert len(pages.own(f"docs/{guide}.md")) == OWN.get(guide, 0)
 
 
-def test_the_robot_of_a_page_earns_and_can_be_drawn(tmp_path, monkeypatch):
+def test_the_robot_of_a_page_earns_and_can_be_drawn(tmp_path):
     (block,) = pages.blocks("experiments/README.md")
     (tmp_path / "cart.xml").write_text(
         """<mujoco><worldbody><body><geom size=".1"/>
         <joint name="x" type="slide" axis="1 0 0" range="-2 2"/></body></worldbody>
         <actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
     )
-    monkeypatch.chdir(tmp_path)
-    names = {}
+    names = {"__file__": str(tmp_path / "my_robot.py")}
     exec(block, names)
     robot = names["robot"]("mujoco")
     obs, action = jnp.array([0.5, 2.0]), jnp.zeros(1)

@@ -19,7 +19,8 @@ import pytest
 import runs
 
 import jaxpets
-from experiments import build
+from experiments import build, model_file
+from experiments.config import Config
 from experiments.errors import CheckpointError, InterruptedRun, UsageError
 from experiments.play import __main__ as command_line
 from experiments.play.clock import Clock
@@ -704,10 +705,20 @@ def test_a_file_of_a_model_runs_no_file(cheetah, tmp_path):
     for about, error in (
         ({"environment": "/tmp/my.py:robot"}, UsageError),
         ({"environment": "pets/half_cheetah", "search": {"settings": 3}}, None),
-        ({"environment": "pets/half_cheetah"}, CheckpointError),
         ({}, UsageError),
     ):
         path = tmp_path / "m.safetensors"
         jaxpets.save_model(path, model, params, about=about)
         with pytest.raises(error or CheckpointError):
             source.found(str(path))
+
+
+def test_a_file_that_says_no_search_is_planned_with_as_zero_shot_does(
+    cheetah, tmp_path
+):
+    _, model, params = cheetah
+    path = tmp_path / "m.safetensors"
+    jaxpets.save_model(path, model, params, about={"environment": "pets/half_cheetah"})
+    performed = model_file.config_of(path, Config()).task_planner
+    assert source.found(str(path)).search == performed
+    assert performed.num_particles == model.num_members

@@ -278,6 +278,21 @@ def test_robots_of_one_preset_are_kept_apart(tmp_path):
     assert "| walk-forward | 7.0 (1 seed) |\n" in text and "paper: SU" not in text
 
 
+def test_what_a_model_of_a_file_did_is_a_report_of_its_own(tmp_path):
+    """Of the same seed, and after more trials than a run that was explored here."""
+    write_arm(tmp_path, "epistemic", [2.0])
+    folder = tmp_path / "shown" / "zero-shot-060"
+    rows = zero_shot_rows("epistemic", [9.0], explored=60)
+    write_run(folder, rows, phase="zero-shot", arm="epistemic")
+    (folder / "run.json").write_text(json.dumps({"id": "0", "model": "a digest"}))
+    text, table = report_of(tmp_path)
+    assert table["epistemic"]["forward"]["seeds"] == [2.0]
+    assert "after 3 exploration trials" in text
+    theirs = (tmp_path / "report" / "report-models.md").read_text()
+    assert theirs.startswith("# Report of preset `models`\n")
+    assert "| forward | 9.0 (1 seed) |" in theirs
+
+
 def test_data_efficiency_is_a_table_of_its_own(out):
     rows = zero_shot_rows("epistemic", [50.0, 60.0, 70.0], explored=1)
     folder = out / "laptop-epistemic" / "zero-shot-001"
