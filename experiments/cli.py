@@ -46,6 +46,12 @@ def parse(argv: Sequence[str], source: Config | None = None) -> Config:
       CheckpointError: if there is no run to start from, or it cannot be read.
       SystemExit: after `--help`.
     """
+    for word in argv:
+        try:
+            word.encode()
+        except UnicodeEncodeError as error:
+            valid = "it must be text in UTF-8"
+            raise UsageError(f"{word!a} is not valid; {valid}.") from error
     phase, rest = _phase(argv)
     config = _config(phase, rest, _preset(rest))  # what is wrong comes before the run
     if phase in ("zero-shot", "finetune", "distill"):
@@ -89,10 +95,19 @@ def explored_run(config: Config) -> Path:
     return _source(config).resolve()
 
 
+def run_name(config: Config) -> str:
+    """Returns what the folder of an exploration is called in that of all runs."""
+    study = rundir.study({"preset": config.preset, "env": config.env})
+    return config.name or f"{study}-{rundir.label(config.arm)}"
+
+
 def results_folder(config: Config) -> Path:
     """Returns where later phases put theirs: in the run they start from, if it is one.
 
     What starts from a file of a model goes into a folder of its name.
+
+    Raises:
+      UsageError: if that is a file, or the folder of a run.
     """
     source = explored_run(config)
     if not source.is_file():
@@ -100,7 +115,12 @@ def results_folder(config: Config) -> Path:
     assert config.source is not None
     name = "-".join(config.source.with_suffix("").parts)
     shipped = config.source.parts[:1] == (model_file.PRETRAINED,)
-    return config.out.resolve() / (name if shipped else source.stem)
+    folder = config.out.resolve() / (name if shipped else source.stem)
+    own = folder.is_file() or (folder / rundir.CONFIG).exists()
+    valid = f"another; what {config.source} does goes to {folder}, which is "
+    valid += "a file" if folder.is_file() else "an exploration's"
+    require(not own, "--out", config.out, valid)
+    return folder
 
 
 def variant(config: Config, step: int) -> str:
@@ -143,9 +163,7 @@ def _config(phase: Phase, argv: Sequence[str], default: Config) -> Config:
 
 def _source(config: Config) -> Path:
     """Returns the folder of a run, or the file of a model."""
-    study = rundir.study({"preset": config.preset, "env": config.env})
-    name = config.name or f"{study}-{rundir.label(config.arm)}"
-    return model_file.named(config.source or config.out / name)
+    return model_file.named(config.source or config.out / run_name(config))
 
 
 def _explored(config: Config) -> Config:

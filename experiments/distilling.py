@@ -40,7 +40,7 @@ from .model_file import Source
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
 from .phases import placed
-from .policy import export, make_distiller
+from .policy import export, make_distiller, policy_files
 from .progress import Progress, Watch
 from .refit import refitted
 from .storage import rundir
@@ -84,7 +84,7 @@ def distill(
     tasks = robots.chosen(config, robot)
     count = config.eval_trials
     num_rows = 3 * len(config.seeds) * len(tasks.names) * count
-    if run.performed(num_rows):
+    if run.performed(num_rows, *policy_files(config)):
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)
@@ -281,5 +281,6 @@ def _summary(rows: list[dict[str, Any]], names: Sequence[str], seconds: float) -
             share = f" ({mean / planner:.0%})" if planner > 0 else ""
             shown.append(f"{who} {mean:6.0f}{share}")
         lines.append(f"  {name:11} {'  '.join(shown)}")
-    lines += [f"  {line}" for line in records.not_finite(rows, names)]
+    also = [*records.diverged(rows), *records.not_finite(rows, names)]
+    lines += [f"  {line}" for line in also]
     return "\n".join(lines)

@@ -177,6 +177,11 @@ def _acts(found: Policy, robot: Robot) -> Callable[..., jaxpets.typing.PlanOutpu
     return act
 
 
+def policy_files(config: Config) -> list[str]:
+    """Returns the names of the files of a distill's policies, one a seed."""
+    return [f"policy-{seed}.safetensors" for seed in config.seeds]
+
+
 def export(
     run: RunFolder, config: Config, parts: Parts, tasks: Tasks,
     networks: ActorCriticParams, source: model_file.Source, step: int,
@@ -200,21 +205,23 @@ def export(
         "action_low": env.action_low,
         "action_high": env.action_high,
     }
-    for i, seed in enumerate(config.seeds):
-        name = f"policy-{seed}"
+    for i, (seed, file) in enumerate(
+        zip(config.seeds, policy_files(config), strict=True)
+    ):
+        onnx = f"{Path(file).stem}.onnx"
         params = jax.tree.map(operator.itemgetter(i), networks)
         training = model_file.training(run, config, seed, step) | origin
         save = functools.partial(
             save_policy, params=params, space=space, **built,
             about={**about, "training": training},
         )  # fmt: skip
-        run.export(f"{name}.safetensors", save)
+        run.export(file, save)
         try:
             content = to_onnx(params, space, **built)
         except (ImportError, ValueError) as error:
-            run.say(f"no {name}.onnx: {error}")
+            run.say(f"no {onnx}: {error}")
             continue
-        run.export(f"{name}.onnx", functools.partial(_write, content))
+        run.export(onnx, functools.partial(_write, content))
 
 
 def _write(content: bytes, target: Path) -> None:

@@ -130,7 +130,7 @@ def describe(rows: Sequence[dict[str, Any]]) -> str:
         if own:
             parts.append(f"{name} {np.mean(own):.0f}")
     value = np.mean([row["value"] for row in rows])
-    text = "  ".join([f"value {value:.3g}", "returns:", *parts, *_diverged(rows)])
+    text = "  ".join([f"value {value:.3g}", "returns:", *parts, *diverged(rows)])
     bad = sum(row.get("bad_plans", 0) for row in rows)
     skipped = sum(row.get("fit", {}).get("num_skipped", 0) for row in rows)
     counts = {"bad plans": bad, "updates refused": skipped}
@@ -147,7 +147,7 @@ def summary(
         own = [row["return"] for row in rows if row["task"] == task]
         each = " ".join(f"{value:.0f}" for value in own)
         lines.append(f"  {task:<{width}}{sum(own) / len(own):8.0f}   trials: {each}")
-    also = [*_diverged(rows), *not_finite(rows, tasks)]
+    also = [*diverged(rows), *not_finite(rows, tasks)]
     return "\n".join([*lines, *(f"  {line}" for line in also)])
 
 
@@ -166,7 +166,7 @@ def not_finite(rows: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> list[
     return lines
 
 
-def _diverged(rows: Sequence[dict[str, Any]]) -> list[str]:
+def diverged(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Returns what is to be said of trials in which physics diverged, if any."""
     lost = [row["lost_steps"] for row in rows if "lost_steps" in row]
     if not lost:

@@ -18,10 +18,12 @@ from tqdm.contrib import DummyTqdmFile
 
 from . import calling, cli, robots, run, signals, user_files
 from .config import UNPLANNED, Config
-from .errors import RunError, last_line
+from .errors import RunError, UsageError, last_line
 from .forecast import Forecast, Sizes
 from .parallel import distributed
 from .progress import Watch
+from .report import logs
+from .storage import metrics, rundir
 from .validate import require
 
 _BAR = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}  {desc}"
@@ -46,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         alone = config.coordinator_address is None
         valid = "left out; a study is of one process"
         require(alone, "--coordinator-address", config.coordinator_address, valid)
+        _check_report(config)
     except RunError as error:
         signals.say(last_line(error))
         return error.exit_code
@@ -56,6 +59,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     if code == 0:
         distributed.say(_last_screen(config, tasks, time.monotonic() - begin))
     return code
+
+
+def _check_report(config: Config) -> None:
+    """Refuses a run beside which the report would count a seed twice."""
+    own, arm = cli.explored_run(config), metrics.arm_label(config.arm, vars(config))
+    said = {"preset": config.preset, "env": config.env}
+    for log in logs.files(config.out, rundir.METRICS):
+        other = logs.config(log.parent)
+        twice = sorted({*config.seeds} & {*other.get("seeds", ())})
+        if (
+            (other.get("phase"), log.parent.resolve() != own) == ("explore", True)
+            and rundir.study(other) == rundir.study(said)
+            and metrics.arm_label(other["arm"], other) == arm
+            and twice
+            and metrics.rows_by_trial(log)
+        ):
+            raise UsageError(
+                f"{log.parent} has seed {twice[0]} of {arm} already, which the report "
+                "would count twice. Choose other --seeds or another --out, or move it."
+            )
 
 
 def _phases(config: Config, arguments: Sequence[str], watch: "_Whole") -> int:
@@ -77,12 +100,12 @@ def _phases(config: Config, arguments: Sequence[str], watch: "_Whole") -> int:
 
 def _source(config: Config) -> list[str]:
     """Returns the flags of phase 2 that name the run, and the user's files in it."""
-    named = ["--from", str(config.out / cli.explored_run(config).name)]
+    named = ["--from", str(config.out / cli.run_name(config))]
     return named + user_files.flags(config.env, config.arm)
 
 
 def _video(config: Config) -> Path:
-    return config.out / f"{cli.explored_run(config).name}.mp4"
+    return config.out / f"{cli.run_name(config)}.mp4"
 
 
 def _sizes(config: Config, num_tasks: int) -> Sizes:
@@ -104,7 +127,7 @@ def _last_screen(config: Config, tasks: Sequence[str], seconds: float) -> str:
     made = {
         out / "report" / "report.md": "tables and figures of all runs",
         **{path: "the robot at that task" for path in [video, *videos]},
-        out / cli.explored_run(config).name: "the explored model, its log and settings",
+        out / cli.run_name(config): "the explored model, its log and settings",
     }
     found = {str(path): text for path, text in made.items() if path.exists()}
     width = max(map(len, found))

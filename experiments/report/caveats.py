@@ -36,6 +36,7 @@ def sentences(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
         *_not_finite(rows),
         *_diverged(rows),
         *_torn({row.run for row in rows}),
+        *_robots({row.run: row.phase for row in rows}),
         *_unequal({row.run: row.phase for row in rows}),
     ]
 
@@ -147,6 +148,24 @@ def _torn(runs: Iterable[Path]) -> Iterator[str]:
             yield f"The last line of {run.name}/metrics.jsonl is cut off; left out."
 
 
+def _robots(runs: dict[Path, str]) -> Iterator[str]:
+    """Says if robots that share a name, as two files may, observe other things."""
+    found: dict[tuple[str, ...], set[str]] = {}
+    for run, phase in runs.items():
+        entries = rundir.find_json(run / rundir.IDENTITY).get("entries")
+        if isinstance(entries, list):
+            names = found.setdefault(tuple(map(str, entries)), set())
+            names.add(_label(run, phase))
+    if len(found) > 1:
+        each = "; ".join(_list(sorted(names)) for names in found.values())
+        yield f"Unequal robots, which observe other entries: {each}."
+
+
+def _label(run: Path, phase: str) -> str:
+    """Returns the name of the exploration that a run is, or is in."""
+    return run.name if phase == "explore" else run.parent.name
+
+
 def _unequal(runs: dict[Path, str]) -> Iterator[str]:
     """Says which settings differ between runs of a phase that share a table."""
     for phase in sorted(set(runs.values())):
@@ -154,7 +173,7 @@ def _unequal(runs: dict[Path, str]) -> Iterator[str]:
         values: dict[str, dict[str, set[str]]] = {}
         labels = set()
         for run in sorted(run for run in runs if runs[run] == phase):
-            label = run.parent.name if phase != "explore" else run.name
+            label = _label(run, phase)
             labels.add(label)
             for name, value in flat(rundir.find_json(run / rundir.CONFIG)).items():
                 if settings.get(name, True):
@@ -176,4 +195,5 @@ def _settings(phase: str) -> dict[str, bool]:
     for role in _DEPENDS_ON[phase]:
         for entry in entries(role):
             found[entry.name] = Mark.COUNTED not in entry.marks
+    found["policy"] = phase == "zero-shot"  # which a search then begins with
     return found

@@ -59,10 +59,16 @@ def load(out: Path) -> list[Row]:
 
 
 def files(out: Path, name: str) -> list[Path]:
-    """Returns the files of a name at any depth under a folder but for hidden ones."""
+    """Returns the files of a name at any depth under a folder but for hidden ones.
+
+    A run in it may be a link to a folder elsewhere, as on a larger disk.
+    """
+    whole = out.resolve()
+    links = (x for x in out.glob("*") if x.is_symlink() and x.is_dir())
+    roots = [out, *(x for x in links if not x.resolve().is_relative_to(whole))]
     return [
         path
-        for path in sorted(out.rglob(name))
+        for path in sorted(path for root in roots for path in root.rglob(name))
         if not any(part.startswith(".") for part in path.relative_to(out).parts)
     ]
 

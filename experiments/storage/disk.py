@@ -56,6 +56,9 @@ def sweep(folder: Path) -> None:
     for name in folder.glob(f"{_DRAFT}*"):
         with contextlib.suppress(OSError):
             name.unlink()
+    for name in folder.glob(".writing-*"):  # the library's, of files of tensors
+        if not name.is_symlink():
+            shutil.rmtree(name, ignore_errors=True)
 
 
 @contextlib.contextmanager

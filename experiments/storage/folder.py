@@ -61,12 +61,12 @@ class RunFolder(NamedTuple):
         """Returns whether what a video is made of is there, and whole."""
         return distributed.on_first(lambda: trajectories.is_whole(self.trajectories))
 
-    def performed(self, num_rows: int) -> bool:
-        """Returns whether a phase that ends with so many rows has ended.
+    def performed(self, num_rows: int, *files: str) -> bool:
+        """Returns whether a phase that ends with so many rows, and files, has ended.
 
         If it has and then lost a part, what is left of its log is set aside.
         """
-        return distributed.on_first(lambda: self._performed(num_rows))
+        return distributed.on_first(lambda: self._performed(num_rows, files))
 
     def restore(self, template: Any, *, part: bool = False) -> tuple[int, Any] | None:
         """Returns trial and state of the last checkpoint, None before the first.
@@ -235,14 +235,15 @@ class RunFolder(NamedTuple):
             finite=finite, milestones=self.milestones,
         )  # fmt: skip
 
-    def _performed(self, num_rows: int) -> bool:
+    def _performed(self, num_rows: int, files: Sequence[str]) -> bool:
         found = metrics.rows_by_trial(self._log).total()
-        whole = trajectories.is_whole(self.trajectories)
-        if found == num_rows and whole:
+        lost = [path for path in map(self.path.joinpath, files) if not path.is_file()]
+        lost += [self.trajectories] * (not trajectories.is_whole(self.trajectories))
+        lost += [self._log] * (found != num_rows)
+        if not lost:
             return True
         if found or self.trajectories.exists():
-            what = self._log if found != num_rows else self.trajectories
-            self.say(f"warning: {what} is not whole: performing again.")
+            self.say(f"warning: {lost[-1]} is not whole: performing again.")
         metrics.cut_log(self._log, 0)
         return False
 

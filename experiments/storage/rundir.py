@@ -9,6 +9,7 @@ import os
 import re
 import socket
 import time
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -52,11 +53,12 @@ def label(text: str) -> str:
     """Returns what folders and logs call a robot or an arm.
 
     That is its name, with dashes for what no file may be called; a function of a file,
-    FILE.py:NAME, is FILE-NAME.
+    FILE.py:NAME, is FILE-NAME. One of which nothing is left is a checksum.
     """
     if own := re.fullmatch(r"(.+)\.py(?::(\w+))?", text, re.DOTALL):
         text = "-".join(filter(None, (Path(own[1]).name, own[2])))
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip("._-")[:64]
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip("._-")[:64]
+    return plain or f"{zlib.crc32(text.encode(errors='surrogateescape')):08x}"
 
 
 def study(config: Mapping[str, Any]) -> str:

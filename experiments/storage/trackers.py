@@ -130,13 +130,15 @@ def _line(error: Exception) -> str:
 def scalars(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Returns the numbers of rows of one phase by name, means where rows share one.
 
-    A name is as `explore/fit/nll`, and says task and seed where there are several.
+    A name is as `explore/fit/nll`, and says task and seed where there are several, and
+    who acts in distill.
     """
     several = len({row["seed"] for row in rows}) > 1
     found: dict[str, list[float]] = {}
     for row in map(rundir.plain, rows):
         task = row.get("task")
         tail = [task] * bool(task) + [f"seed {row['seed']}"] * several
+        tail += [row["planner"]] if row["phase"] == "distill" else []
         numbers = {name: row.get(name) for name in _NUMBERS}
         for group in _GROUPS:
             if group != "returns" or not task:  # a task's own return is enough

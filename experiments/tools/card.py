@@ -125,7 +125,7 @@ def _facts(file: Path, run: Path, returns: Sequence[Path] | None) -> _Facts:
         config = exploration.config_of(RunFolder(run))
     logged = (log.parent for log in run.glob(f"zero-shot-*/{rundir.METRICS}"))
     performed = []
-    for folder in sorted(logged) if returns is None else returns:
+    for folder in sorted(filter(_as_shared, logged)) if returns is None else returns:
         rows = [r for r in _rows(folder) if (r.seed, r.explored) == (seed, trials)]
         if rows:
             device = _device(rundir.find_json(folder / rundir.ENVIRONMENT))
@@ -136,6 +136,12 @@ def _facts(file: Path, run: Path, returns: Sequence[Path] | None) -> _Facts:
     explored = [row for row in _rows(run) if row.seed == seed and row.trial <= trials]
     model, _ = jaxpets.load_model(file)
     return _Facts(file, about, model, config, explored, performed)
+
+
+def _as_shared(folder: Path) -> bool:
+    """Tells if what performed in a folder is what explored, and no more."""
+    config = exploration.config_of(RunFolder(folder))
+    return config.refit.num_epochs == 0 and config.policy is None
 
 
 def _rows(folder: Path) -> list[Row]:

@@ -45,9 +45,12 @@ def share(
       half: whether weights are rounded to float16.
 
     Raises:
-      RunError: if the run has no checkpoint or not that seed, or its robot is of a
-        file that nobody named.
+      RunError: if the run is of another phase, or has no checkpoint or not that seed,
+        or its robot is of a file that nobody named.
     """
+    phase = exploration.config_of(RunFolder(run)).phase
+    if phase not in ("explore", "zero-shot"):
+        raise UsageError(f"{run} is of {phase}; share an exploration, or a zero-shot.")
     found = exploration.explored(run, seed=seed, env=env)
     config = found.config
     search = quick_search(config)

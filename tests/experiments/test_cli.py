@@ -127,6 +127,15 @@ def test_a_name_is_that_of_one_folder(fail, out, name):
     assert not out.exists()
 
 
+def test_a_name_is_text(fail, out):
+    code, line = fail(*SMOKE, "--name", "by\udcffte")
+    assert (code, line) == (
+        2,
+        "error: 'by\\udcffte' is not valid; it must be text in UTF-8.\n",
+    )
+    assert not out.exists()
+
+
 def test_a_phase_is_needed(fail):
     code, line = fail("--preset", "smoke")
     assert code == 2 and "--phase is missing" in line and "explore, zero-shot" in line

@@ -49,5 +49,7 @@ def test_a_new_folder_is_on_the_disk(tmp_path, monkeypatch):
 def test_drafts_of_the_killed_are_swept(tmp_path):
     (tmp_path / ".tmp-0badcafe.npz").write_text("half")
     (tmp_path / "a").write_text("whole")
+    (tmp_path / ".writing-0badcafe").mkdir()
+    (tmp_path / ".writing-0badcafe" / "policy.safetensors").write_text("half")
     disk.sweep(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["a"]

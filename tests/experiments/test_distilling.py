@@ -104,6 +104,9 @@ def test_a_planner_that_earns_nothing_has_no_share():
     rows[1]["return"] = np.nan
     text = distilling._summary(rows, ["hop"], 1.0)
     assert text.splitlines()[-1].startswith("  the reward of hop is not finite in 1 of")
+    rows[0]["lost_steps"] = 7
+    text = distilling._summary(rows, ["hop"], 1.0)
+    assert "  physics diverged in 1 of 3 trials: 7 steps lost\n" in text
 
 
 def test_a_task_is_seen_by_its_weights_or_as_one_of_several():

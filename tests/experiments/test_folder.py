@@ -175,6 +175,18 @@ def test_what_has_performed_is_whole_or_performs_again(tmp_path, capsys):
         assert trials(run) == []
 
 
+def test_what_has_lost_a_file_performs_again(tmp_path, capsys):
+    run, policy = RunFolder(tmp_path), tmp_path / "policy-0.safetensors"
+    run.save_trajectories({"obs": np.arange(3)})
+    run.log([{"trial": 1}])
+    policy.touch()
+    assert run.performed(1, policy.name) and capsys.readouterr().err == ""
+    policy.unlink()
+    assert not run.performed(1, policy.name)
+    words = f"warning: {policy} is not whole: performing again.\n"
+    assert capsys.readouterr().err == words
+
+
 def test_what_becomes_of_a_run_is_written(tmp_path):
     with opened(tmp_path) as run:
         assert run.path == tmp_path and run.milestones == (1,)

@@ -399,6 +399,7 @@ def test_a_robot_whose_package_is_missing_is_one_line(monkeypatch):
         ("../a b/my_robot.py:other", "my_robot-other"),
         ("info-gain", "info-gain"),
         ("../\x1b/x", "x"),
+        ("小车.py", "9b99d2db"),
     ],
 )
 def test_what_folders_call_it(text, label):

@@ -278,6 +278,16 @@ def test_robots_of_one_preset_are_kept_apart(tmp_path):
     assert "| walk-forward | 7.0 (1 seed) |\n" in text and "paper: SU" not in text
 
 
+def test_robots_that_share_a_name_alone_are_named(tmp_path):
+    for seed, entries in enumerate((["x"], ["x"], ["x", "hinge"])):
+        run = tmp_path / f"run-{seed}"
+        write_run(run, explore_rows("epistemic", [seed]), phase="explore")
+        written = {"id": str(seed), "model": None, "entries": entries}
+        (run / "run.json").write_text(json.dumps(written))
+    text, _ = report_of(tmp_path)
+    assert "- Unequal robots, which observe other entries: run-0, run-1; run-2." in text
+
+
 def test_what_a_model_of_a_file_did_is_a_report_of_its_own(tmp_path):
     """Of the same seed, and after more trials than a run that was explored here."""
     write_arm(tmp_path, "epistemic", [2.0])

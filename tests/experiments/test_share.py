@@ -90,6 +90,33 @@ def test_a_zero_shot_without_a_log_is_not_in_the_card(explored, tmp_path, capsys
     assert {x.name for x in tmp_path.iterdir()} == {"run", path.name, "m.md"}
 
 
+def test_a_card_is_of_the_model_that_is_shared(explored, tmp_path, capsys):
+    """What performed after a refit, or from a policy on, is another matter."""
+    run, path = tmp_path / "run", tmp_path / "m.safetensors"
+    shutil.copytree(explored, run)
+    config = json.loads((run / "config.json").read_text()) | {"phase": "zero-shot"}
+    changes = {"a": {}, "b": {"refit": {"num_epochs": 9}}, "c": {"policy": "p"}}
+    for i, (tag, change) in enumerate(changes.items()):
+        folder = run / f"zero-shot-003-{tag}"
+        folder.mkdir()
+        refit = config["refit"] | change.get("refit", {"num_epochs": 0})
+        own = config | change | {"refit": refit}
+        (folder / "config.json").write_text(json.dumps(own))
+        row = {
+            "phase": "zero-shot", "arm": "epistemic", "seed": 0, "task": "forward",
+            "trial": 1, "explored_trials": 3, "return": 100.0 + i,
+        }  # fmt: skip
+        (folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
+    assert share.main([str(run), str(path)]) == 0
+    said = path.with_suffix(".md").read_text()
+    assert "| forward | 100 " in said and "101" not in said and "102" not in said
+    capsys.readouterr()
+    learned = json.dumps(config | {"phase": "distill"})
+    (run / "zero-shot-003-a" / "config.json").write_text(learned)
+    assert share.main([str(run / "zero-shot-003-a"), str(path)]) == 2
+    assert "is of distill; share an exploration, or a" in capsys.readouterr().err
+
+
 def test_a_folder_is_no_file_of_a_model(explored, tmp_path, capsys):
     folder = tmp_path / "models"
     folder.mkdir()

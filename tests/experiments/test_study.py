@@ -90,6 +90,26 @@ def test_elsewhere_it_prints_lines_and_says_what_was_made(out, capsys):
     assert last.endswith(f"  python -m experiments.run finetune {named}\n")
 
 
+def test_the_folder_of_the_run_may_be_a_link_to_another_disk(out, tmp_path, capsys):
+    """Phase 2 and the report find it by its name."""
+    (tmp_path / "mine").symlink_to(out / NAME)
+    flags = [*FLAGS, "--out", str(tmp_path), "--name", "mine"]
+    assert study.main(flags) == 0
+    said = capsys.readouterr().err
+    assert f"finetune --from {tmp_path / 'mine'}" in said
+    report = (tmp_path / "report" / "report.md").read_text()
+    assert "`own_robot-novelty`: explored 2 trials (seeds 0); 1 zero-shot" in report
+
+
+def test_a_seed_that_the_report_would_count_twice_is_refused(out, capsys):
+    """Before anything is explored."""
+    flags = [*FLAGS, "--out", str(out), "--name", "second"]
+    assert study.main(flags) == 2
+    text = capsys.readouterr().err
+    assert f"{out / NAME} has seed 0 of own_robot-novelty already" in text
+    assert text.count("\n") == 1 and not (out / "second").exists()
+
+
 @pytest.mark.parametrize(
     ("flags", "said"),
     [

@@ -89,6 +89,11 @@ def test_numbers_have_the_names_of_what_they_are():
     ]
     found = trackers.scalars(zero)
     assert found["zero-shot/return/run"] == 1.5  # trials of one seed
+    three = [
+        row(1, phase="distill", task="run", planner=who, **{"return": i})
+        for i, who in enumerate(("plan", "policy", "both"))
+    ]
+    assert trackers.scalars(three)["distill/return/run/policy"] == 1.0
     assert not any("returns" in name for name in found)
 
 

@@ -83,6 +83,23 @@ def test_a_file_acts_as_the_run_that_it_is_of(explored, file, tmp_path):
     assert all(np.isfinite(list(want.values())))
 
 
+def test_a_file_does_not_perform_in_the_folder_of_a_run(
+    explored, file, tmp_path, capsys
+):
+    """Whose own zero-shot it would then be refused."""
+    (tmp_path / "mine").symlink_to(explored)
+    (tmp_path / "theirs").touch()
+    theirs = tmp_path / "models" / "theirs.safetensors"
+    theirs.parent.mkdir()
+    theirs.write_bytes(file.read_bytes())
+    for source, words in (
+        (file, f"goes to {tmp_path / 'mine'}, which is an exploration's"),
+        (theirs, f"goes to {tmp_path / 'theirs'}, which is a file"),
+    ):
+        assert zero_shot(source, tmp_path) == 2
+        assert words in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_a_file_says_how_its_model_came_to_be(explored, file):
     training = models.about(file)["training"]
     performed = exploration.config_of(RunFolder(explored / "zero-shot-003-front-flip"))
