@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from .errors import UsageError, reason
+from .storage import rundir
 
 T = TypeVar("T")
 _FORM = re.compile(r"(.+\.py)(?::(\w+))?", re.DOTALL)
@@ -36,10 +37,18 @@ def digests(texts: Iterable[str | None]) -> dict[str, str]:
     named = (_FORM.fullmatch(text) or [text, text] for text in texts if text)
     files = {Path(form[1]) for form in named}
     return {
-        f"the content of {file}": hashlib.sha256(file.read_bytes()).hexdigest()[:8]
+        _content(file): _digest(file)
         for file in sorted(files)
         if file.suffix and file.is_file()
     }
+
+
+def _content(file: str | Path) -> str:
+    return f"the content of {Path(file)}"
+
+
+def _digest(file: str | Path) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:8]
 
 
 def named(flag: str, said: str | None, found: str, where: Path) -> str:
@@ -64,7 +73,8 @@ def named(flag: str, said: str | None, found: str, where: Path) -> str:
     if not is_same(said, found, where.parent):
         raise UsageError(
             f"{flag} {said} is not valid; it must be the file that {where} has, {found}"
-            ", seen from here or from a folder that the run is in."
+            ", seen from here or from a folder that the run is in, or else one of its "
+            "name with the same content."
         )
     return said  # and never what the config says, which is another file from here
 
@@ -73,7 +83,7 @@ def is_same(said: Any, found: Any, run: Path) -> bool:
     """Returns whether a command line and a config name one function of one file.
 
     A config does not say where its command was started. Most are in the folder of that,
-    or below it.
+    or below it. A file that was moved is known by its name and its content.
 
     Args:
       said: in the command line; files alone are compared by more than their text.
@@ -89,7 +99,11 @@ def is_same(said: Any, found: Any, run: Path) -> bool:
     own, its = (form[1] for form in forms)
     folders = (Path(), run.resolve(), *run.resolve().parents)
     try:
-        return any(_is_same(str(folder / its), own) for folder in folders)
+        if any(_is_same(str(folder / its), own) for folder in folders):
+            return True
+        began = rundir.find_json(run / rundir.ENVIRONMENT).get(_content(its))
+        moved = Path(own).name == Path(its).name and Path(own).is_file()
+        return moved and began == _digest(own)
     except ValueError:  # of a stranger's text that names no file
         return False
 

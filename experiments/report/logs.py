@@ -34,28 +34,28 @@ def load(out: Path) -> list[Row]:
     """Reads every metrics.jsonl under a folder, hidden ones left out.
 
     Lines that are no rows are left out too, as `metrics.read` says. So is what a run
-    did for one task where it did the same for all.
+    did for some tasks where it did the same for others as well.
 
     Raises:
       UsageError: if there is no log, or two rows for one seed, task and trial of an
         arm: averaging them would count a seed twice.
       CheckpointError: as `config`.
     """
-    logs = [log for log in files(out, rundir.METRICS) if not _is_part(log)]
+    logs = sorted(files(out, rundir.METRICS), key=_is_part)  # those of all tasks first
     rows = [row for log in logs for row in metrics.read(log, config(log.parent))]
     if not rows:
         raise UsageError(f"there is no metrics.jsonl with a row under {out}.")
     seen: dict[tuple[Any, ...], Row] = {}
     for row in rows:
         first = seen.setdefault(row[:-2], row)
-        if first is not row:
+        if first is not row and not _is_again(row, first):
             task = f", task {row.task}" if row.task else ""
             raise UsageError(
                 f"{first.run} and {row.run} both hold trial {row.trial} of seed "
                 f"{row.seed}{task}, phase {row.phase}, arm {row.arm}, preset "
                 f"{row.preset}; move one of them elsewhere."
             )
-    return rows
+    return list(seen.values())
 
 
 def files(out: Path, name: str) -> list[Path]:
@@ -71,6 +71,16 @@ def files(out: Path, name: str) -> list[Path]:
         for path in sorted(path for root in roots for path in root.rglob(name))
         if not any(part.startswith(".") for part in path.relative_to(out).parts)
     ]
+
+
+def _is_again(row: Row, first: Row) -> bool:
+    """Tells if a row is of a task that the same run performed among others before."""
+    if row.phase == "explore" or row.run.parent != first.run.parent:
+        return False
+    if _is_part(row.run / rundir.METRICS):
+        return True
+    one, other = ({**x.data, "seconds": None} for x in (row, first))
+    return one == other
 
 
 def _is_part(log: Path) -> bool:

@@ -133,16 +133,20 @@ def restore(
     """
     directory = Path(directory).resolve()
     refused: dict[int, _DamagedError] = {}
-    for number in [n for n in names(directory)[::-1] if step in (None, n)]:
+    listed = names(directory)
+    for number in [n for n in listed[::-1] if step in (None, n)]:
         try:
             state, meta = _read(directory, number, template, part, foreign)
         except _DamagedError as error:
-            refused[number] = error
+            if number in names(directory):  # else it was dropped as we read it
+                refused[number] = error
             continue
         for bad, why in refused.items():
             fate = step_folders.quarantine(directory, bad, why.kind)
             warn(f"checkpoint {bad} is {why.kind} ({why}); {fate}, using {number}.")
         return number, state, meta
+    if step is None and names(directory)[-1:] != listed[-1:]:  # its run goes on
+        return restore(directory, template, part=part, warn=warn, foreign=foreign)
     if step is not None:
         others = _listed([number for number in steps(directory) if number != step])
         what = f"checkpoint {step} in {directory}"

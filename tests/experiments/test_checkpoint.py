@@ -63,6 +63,22 @@ def test_nothing_to_restore(tmp_path):
     assert checkpoint.steps(tmp_path) == []
 
 
+def test_a_reader_of_a_run_that_goes_on_takes_what_is_newest(tmp_path, monkeypatch):
+    """The step that it chose is dropped as it reads, and the run has another by now."""
+    read, later = checkpoint._read, [2]
+
+    def slowly(*args):
+        for step in [later.pop()] if later else []:
+            checkpoint.save(tmp_path, step, make_state(step), {}, keep=1)
+        return read(*args)
+
+    checkpoint.save(tmp_path, 1, make_state(1), {}, keep=1)
+    monkeypatch.setattr(checkpoint, "_read", slowly)
+    found = checkpoint.restore(tmp_path, make_state(0), warn=fail)
+    assert found is not None and found[0] == 2
+    assert as_bytes(found[1]) == as_bytes(make_state(2))
+
+
 def test_a_given_step(directory):
     found, warnings = restore(directory, step=1)
     assert found[0] == 1

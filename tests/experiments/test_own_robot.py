@@ -160,6 +160,19 @@ def test_a_run_goes_on_from_another_folder(tmp_path, monkeypatch, capsys):
     line = ["zero-shot", "--from", "runs/begun", "--eval-trials", "1"]
     assert main([*line, "--env", "cart.py"]) == 0
     assert "already complete" in capsys.readouterr().err
+    # A file that was moved is known by its name and content.
+    moved = tmp_path / "new" / "cart.py"
+    moved.parent.mkdir()
+    (tmp_path / "cart.py").rename(moved)
+    explore = [*begin, "2", "--name", "begun"]
+    for command in (explore, line):
+        assert main([*command, "--env", "new/cart.py"]) == 0
+        said = capsys.readouterr().err
+        assert "already complete" in said and "warning" not in said
+    moved.write_text(f"{text}\n# edited")
+    for command in (explore, line):
+        assert main([*command, "--env", "new/cart.py"]) in (2, 3)
+        assert "new/cart.py" in capsys.readouterr().err
     assert not (tmp_path / "ran").exists()
 
 

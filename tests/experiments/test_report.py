@@ -1,6 +1,7 @@
 """The report, from small logs whose every number is known."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -192,6 +193,35 @@ def test_some_tasks_alone_do_not_count_beside_all(out, tasks):
     (run / "zero-shot-003" / "metrics.jsonl").unlink()
     _, table = report_of(out)
     assert table["epistemic"]["forward"]["seeds"] == [1.0]
+
+
+def test_what_all_tasks_lack_is_that_of_some(out):
+    """As after a finetune of one task, and then one of all that was killed."""
+    part = out / "laptop-count" / "finetune-003-forward"
+    rows = [x for x in finetune_rows("count", [0]) if x["task"] == "forward"]
+    write_run(part, rows, phase="finetune", arm="count", task="forward")
+    log = out / "laptop-count" / "finetune-003" / "metrics.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(x for x in lines if json.loads(x)["trial"] == EXPLORED + 1))
+    tuned = logs.tuning(load(out), "forward", EXPLORED)["count-16"]
+    assert tuned[EXPLORED + 1] == {0: 1000.0, 1: 1001.0}  # each once
+    assert tuned[EXPLORED + 2] == {0: 2000.0}
+
+
+def test_a_task_that_is_performed_again_beside_another_counts_once(out):
+    run = out / "laptop-epistemic"
+    shutil.rmtree(run / "zero-shot-003")
+    for tasks in ("forward", "forward,backward"):
+        found = zero_shot_rows("epistemic", [1.0])
+        rows = [row for row in found if row["task"] in tasks.split(",")]
+        name = f"zero-shot-003-{tasks.replace(',', '-')}"
+        config = {"phase": "zero-shot", "arm": "epistemic", "task": tasks}
+        write_run(run / name, rows, **config)
+    _, table = report_of(out)
+    assert table["epistemic"]["forward"]["seeds"] == [1.0]
+    edit_rows(run / name / "metrics.jsonl", lambda row: row | {"return": 5.0})
+    with pytest.raises(UsageError, match="both hold trial 1 of seed 0, task forward"):
+        load(out)
 
 
 def test_a_run_that_is_called_all_counts(out):
