@@ -97,8 +97,7 @@ def explored_run(config: Config) -> Path:
 
 def run_name(config: Config) -> str:
     """Returns what the folder of an exploration is called in that of all runs."""
-    study = rundir.study({"preset": config.preset, "env": config.env})
-    return config.name or f"{study}-{rundir.label(config.arm)}"
+    return config.name or f"{rundir.study(vars(config))}-{rundir.label(config.arm)}"
 
 
 def results_folder(config: Config) -> Path:

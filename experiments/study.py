@@ -64,14 +64,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _check_report(config: Config) -> None:
     """Refuses a run beside which the report would count a seed twice."""
     own, arm = cli.explored_run(config), metrics.arm_label(config.arm, vars(config))
-    said = {"preset": config.preset, "env": config.env}
     for log in logs.files(config.out, rundir.METRICS):
         other = logs.config(log.parent)
         twice = sorted({*config.seeds} & {*other.get("seeds", ())})
         if (
             (other.get("phase"), log.parent.resolve() != own) == ("explore", True)
-            and rundir.study(other) == rundir.study(said)
-            and metrics.arm_label(other["arm"], other) == arm
+            and rundir.study(other) == rundir.study(vars(config))
+            and metrics.arm_label(other.get("arm", "epistemic"), other) == arm
             and twice
             and metrics.rows_by_trial(log)
         ):

@@ -104,7 +104,7 @@ def is_same(said: Any, found: Any, run: Path) -> bool:
         began = rundir.find_json(run / rundir.ENVIRONMENT).get(_content(its))
         moved = Path(own).name == Path(its).name and Path(own).is_file()
         return moved and began == _digest(own)
-    except ValueError:  # of a stranger's text that names no file
+    except (OSError, ValueError):  # as of a stranger's text that names no file
         return False
 
 
