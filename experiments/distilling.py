@@ -40,7 +40,7 @@ from .model_file import Source
 from .parallel import devices
 from .parallel.devices import AXES, SEED, TASK, Placement
 from .phases import placed
-from .policy import export, make_distiller, policy_files
+from .policy import export, make_distiller, policy_file
 from .progress import Progress, Watch
 from .refit import refitted
 from .storage import rundir
@@ -84,7 +84,7 @@ def distill(
     tasks = robots.chosen(config, robot)
     count = config.eval_trials
     num_rows = 3 * len(config.seeds) * len(tasks.names) * count
-    if run.performed(num_rows, *policy_files(config)):
+    if run.performed(num_rows, *map(policy_file, config.seeds)):
         run.say(f"already complete: {count} of {count} trials.")
         return
     parts = build(config)

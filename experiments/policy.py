@@ -177,9 +177,9 @@ def _acts(found: Policy, robot: Robot) -> Callable[..., jaxpets.typing.PlanOutpu
     return act
 
 
-def policy_files(config: Config) -> list[str]:
-    """Returns the names of the files of a distill's policies, one a seed."""
-    return [f"policy-{seed}.safetensors" for seed in config.seeds]
+def policy_file(seed: int) -> str:
+    """Returns the name of the file of the policy of a seed."""
+    return f"policy-{seed}.safetensors"
 
 
 def export(
@@ -205,10 +205,8 @@ def export(
         "action_low": env.action_low,
         "action_high": env.action_high,
     }
-    for i, (seed, file) in enumerate(
-        zip(config.seeds, policy_files(config), strict=True)
-    ):
-        onnx = f"{Path(file).stem}.onnx"
+    for i, seed in enumerate(config.seeds):
+        file, onnx = policy_file(seed), f"policy-{seed}.onnx"
         params = jax.tree.map(operator.itemgetter(i), networks)
         training = model_file.training(run, config, seed, step) | origin
         save = functools.partial(

@@ -63,17 +63,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _check_report(config: Config) -> None:
     """Refuses a run beside which the report would count a seed twice."""
-    own, arm = cli.explored_run(config), metrics.arm_label(config.arm, vars(config))
+    own, study = cli.explored_run(config), rundir.study(vars(config))
+    arm = metrics.arm_label(config.arm, vars(config))
     for log in logs.files(config.out, rundir.METRICS):
         other = logs.config(log.parent)
+        if other.get("phase") != "explore" or log.parent.resolve() == own:
+            continue
+        its = metrics.arm_label(other.get("arm", "epistemic"), other)
         twice = sorted({*config.seeds} & {*other.get("seeds", ())})
-        if (
-            (other.get("phase"), log.parent.resolve() != own) == ("explore", True)
-            and rundir.study(other) == rundir.study(vars(config))
-            and metrics.arm_label(other.get("arm", "epistemic"), other) == arm
-            and twice
-            and metrics.rows_by_trial(log)
-        ):
+        is_same = (rundir.study(other), its) == (study, arm)
+        if is_same and twice and metrics.rows_by_trial(log):
             raise UsageError(
                 f"{log.parent} has seed {twice[0]} of {arm} already, which the report "
                 "would count twice. Choose other --seeds or another --out, or move it."

@@ -1,6 +1,6 @@
 """Reads the logs of runs, and picks scores and curves out of them."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,14 +41,16 @@ def load(out: Path) -> list[Row]:
         arm: averaging them would count a seed twice.
       CheckpointError: as `config`.
     """
-    logs = sorted(files(out, rundir.METRICS), key=_is_part)  # those of all tasks first
-    rows = [row for log in logs for row in metrics.read(log, config(log.parent))]
+    logs = {log: config(log.parent) for log in files(out, rundir.METRICS)}
+    parts = {log.parent for log, own in logs.items() if _is_part(log, own)}
+    whole_first = sorted(logs, key=lambda log: log.parent in parts)
+    rows = [row for log in whole_first for row in metrics.read(log, logs[log])]
     if not rows:
         raise UsageError(f"there is no metrics.jsonl with a row under {out}.")
     seen: dict[tuple[Any, ...], Row] = {}
     for row in rows:
         first = seen.setdefault(row[:-2], row)
-        if first is not row and not _is_again(row, first):
+        if first is not row and not _is_again(row, first, parts):
             task = f", task {row.task}" if row.task else ""
             raise UsageError(
                 f"{first.run} and {row.run} both hold trial {row.trial} of seed "
@@ -73,20 +75,17 @@ def files(out: Path, name: str) -> list[Path]:
     ]
 
 
-def _is_again(row: Row, first: Row) -> bool:
+def _is_again(row: Row, first: Row, parts: Container[Path]) -> bool:
     """Tells if a row is of a task that the same run performed among others before."""
     if row.phase == "explore" or row.run.parent != first.run.parent:
         return False
-    if _is_part(row.run / rundir.METRICS):
-        return True
     one, other = ({**x.data, "seconds": None} for x in (row, first))
-    return one == other
+    return row.run in parts or one == other
 
 
-def _is_part(log: Path) -> bool:
-    """Tells if the folder beside this one has done all tasks, these among them."""
-    folder = log.parent
-    task = config(folder).get("task", "all")
+def _is_part(log: Path, own: Mapping[str, Any]) -> bool:
+    """Tells if the folder beside that of a log has done all tasks, these among them."""
+    folder, task = log.parent, own.get("task", "all")
     if task == "all":
         return False
     part = f"-{rundir.label(task)}"
