@@ -1,4 +1,4 @@
-"""The set that is run on a GPU: plan, fit, rollout, env and trace, in 9 minutes.
+"""The set that is run on a GPU: plan, fit, rollout, env and trace, in 8 to 12 minutes.
 
 Then prints all rows beside those that are committed for the same kind of device, and
 the plans of other systems. What is slower than nine tenths of its committed speed, both
