@@ -111,6 +111,18 @@ def config(folder: Path) -> dict[str, Any]:
     return found
 
 
+def steps(rows: Iterable[Row], name: str) -> str:
+    """Returns how many steps the rows' trials have, as `250`; empty if none says so.
+
+    Args:
+      rows: of any runs.
+      name: the entry of their configs: `trial_length` or `task_length`.
+    """
+    runs = {row.run for row in rows}
+    found = {rundir.find_json(run / rundir.CONFIG).get(name) for run in runs}
+    return " or ".join(map(str, sorted(x for x in found if isinstance(x, int))))
+
+
 def named_by_tag(rows: Iterable[Row]) -> list[Row]:
     """Returns the rows with their variant in the name of the arm: `best, no-refit`."""
     return [

@@ -28,6 +28,7 @@ from .logs import (
     exploring,
     load,
     scores,
+    steps,
     tuning,
 )
 
@@ -119,7 +120,7 @@ def _write(rows: Sequence[Row], covered: Seen | None, out: Path, files: _Files) 
         "",
         f"![returns over trials]({files.figure_4.name})",
         "",
-        _FIGURE_4,
+        _FIGURE_4 + _lengths(rows),
         "",
         *_exploration(files.exploration),
         *coverage_section.covered(covered, files.coverage),
@@ -140,6 +141,15 @@ def _draw(rows: Sequence[Row], found: Scores, explored: int, files: _Files) -> N
     turns = _curves(exploring(rows, "turns"))
     if value or turns:
         figures.exploration(files.exploration, value, turns)
+
+
+def _lengths(rows: Sequence[Row]) -> str:
+    """Returns a sentence on the two panels, if their trials are not equally long."""
+    explored = steps((row for row in rows if row.phase == "explore"), "trial_length")
+    later = steps((row for row in rows if row.phase != "explore"), "task_length")
+    if not (explored and later) or explored == later:
+        return ""
+    return f" A trial has {explored} steps on the left and {later} on the right."
 
 
 def _exploration(picture: Path) -> list[str]:

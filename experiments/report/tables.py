@@ -164,16 +164,18 @@ def _difference(found: stats.Difference) -> str:
 
 
 def variants(
-    tasks: Sequence[str], scores_at: Mapping[tuple[str, str, int], Scores]
+    tasks: Sequence[str], scores_at: Mapping[tuple[str, str, int, str], Scores]
 ) -> list[str]:
-    """Returns zero-shot scores of runs with a tag, by tag, arm and explored trials."""
+    """Returns zero-shot scores by tag, arm, explored trials and steps of a trial."""
     rows = []
-    for (tag, arm, explored), scores in sorted(scores_at.items()):
+    for (tag, arm, explored, steps), scores in sorted(scores_at.items()):
         by_task = scores[arm]
         cells = [cell(by_task.get(task, {}), full=True) for task in tasks]
         seeds = sorted({seed for task in by_task.values() for seed in task})
-        rows.append([tag, arm, str(explored), " ".join(map(str, seeds)), *cells])
-    return table(["variant", "arm", "explored trials", "seeds", *tasks], rows)
+        told = [tag, arm, str(explored), steps, " ".join(map(str, seeds))]
+        rows.append([*told, *cells])
+    header = ["variant", "arm", "explored trials", "steps of a trial", "seeds"]
+    return table([*header, *tasks], rows)
 
 
 def by_trials(tasks: Sequence[str], scores_at: Mapping[int, Scores]) -> list[str]:

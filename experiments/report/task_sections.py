@@ -1,21 +1,21 @@
 """Sections of the report on the tasks: zero-shot, its variants, fine-tuning."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from . import figures, tables
-from .logs import Row, Scores, named_by_tag, number, scores, tuning
+from .logs import Row, Scores, named_by_tag, number, scores, steps, tuning
 
 _OURS = ("best", "epistemic")  # what the other arms are baselines of
 
 _TABLE_1 = (
-    "The jump-start: the return of a trial under the task's reward before anything is "
-    "learned from it. A seed's score is the mean of its evaluation trials. Cells: mean "
-    "± standard deviation over seeds, [95 % interval of the mean, Student's t over "
-    "seeds], interquartile mean (IQM) from four seeds on."
+    "The jump-start: the return of a trial{} under the task's reward before anything "
+    "is learned from it. A seed's score is the mean of its evaluation trials. Cells: "
+    "mean ± standard deviation over seeds, [95 % interval of the mean, Student's t "
+    "over seeds], interquartile mean (IQM) from four seeds on."
 )
 _FLIPS = (
     " Flips are named by "
@@ -53,8 +53,10 @@ def zero_shot(rows: Sequence[Row], found: Scores, explored: int) -> list[str]:
     found = {arm: found[arm] for arm in tables.in_order(found)}
     tasks, is_paper = tables.tasks_of(rows), rows[0].preset == "paper"
     lines += tables.table_1(tasks, found, with_paper=is_paper)
+    performed = [row for row in rows if row.phase == "zero-shot"]
     lines += [
-        _TABLE_1 + _FLIPS * (tables.TASKS[2] in tasks),
+        _TABLE_1.format(_of(steps(performed, "task_length")))
+        + _FLIPS * (tables.TASKS[2] in tasks),
         "",
         *_random_actions(rows),
         "### Every seed",
@@ -76,9 +78,11 @@ def variants(rows: Sequence[Row]) -> list[str]:
     tagged = [row for row in rows if row.phase == "zero-shot" and row.tag]
     if not tagged:
         return []
-    by_variant: dict[tuple[str, str, int], list[Row]] = {}
+    length = _steps_by_run(tagged)
+    by_variant: dict[tuple[str, str, int, str], list[Row]] = {}
     for row in tagged:
-        by_variant.setdefault((row.tag, row.arm, row.explored), []).append(row)
+        key = row.tag, row.arm, row.explored, length[row.run]
+        by_variant.setdefault(key, []).append(row)
     found = {key: scores(own, key[2]) for key, own in by_variant.items()}
     table = tables.variants(tables.tasks_of(tagged), found)
     return ["## Variants", "", _VARIANTS, "", *table]
@@ -87,12 +91,19 @@ def variants(rows: Sequence[Row]) -> list[str]:
 def compared(rows: Sequence[Row], explored: int, picture: Path) -> list[str]:
     """Draws Table 1 with its variants, and returns the section on their differences.
 
+    Variants whose trials are longer or shorter return other numbers, and are left out.
+
     Args:
       rows: with those of variants.
       explored: the exploration trials that Table 1 is about.
       picture: file to write, if there is a score.
     """
-    found = scores(named_by_tag(rows), explored)
+    performed = [row for row in rows if row.phase == "zero-shot"]
+    length = _steps_by_run(performed)
+    plain = {length[row.run] for row in performed if not row.tag} - {""}
+    as_long = {"", *(plain or length.values())}  # empty where no config says it
+    alike = [row for row in performed if not row.tag or length[row.run] in as_long]
+    found = scores(named_by_tag(alike), explored)
     found = {name: found[name] for name in tables.in_order(found)}
     if not found:
         return []
@@ -155,8 +166,18 @@ def _random_actions(rows: Sequence[Row]) -> list[str]:
             means.append(f"{task} {mean}")
     if not means:
         return []
-    text = f"Random actions, mean of {len(random)} trials: {', '.join(means)}."
+    length = _of(steps(random, "trial_length"))
+    text = f"Random actions, mean of {len(random)} trials{length}: {', '.join(means)}."
     return [text, ""]
+
+
+def _of(steps: str) -> str:
+    return f" of {steps} steps" if steps else ""
+
+
+def _steps_by_run(performed: Iterable[Row]) -> dict[Path, str]:
+    last = {row.run: row for row in performed}
+    return {run: steps([row], "task_length") for run, row in last.items()}
 
 
 def fine_tuning(rows: Sequence[Row], explored: int) -> list[str]:

@@ -125,13 +125,13 @@ def test_report_shows_means_spread_and_every_seed(plain):
     assert "| laptop-epistemic | 3 | 3 | 4.00 | 1.00 | 5.00 |" in text
     assert "jax 9.9, device_kind abacus" in text
     # Trial 1 of 3 seeds, the same in both arms: -(1 + seed).
-    assert "mean of 3 trials: forward -2.0" in text
+    assert "mean of 3 trials of 10 steps: forward -2.0" in text
 
 
 def test_all_trials_of_the_random_arm_are_random(tmp_path):
     write_arm(tmp_path / "runs", "random", [1.0])
     text, _ = report_of(tmp_path / "runs")
-    assert "mean of 3 trials: forward -2.0" in text  # -(trial + seed)
+    assert "mean of 3 trials of 10 steps: forward -2.0" in text  # -(trial + seed)
 
 
 def test_noise_is_neither_a_plan_nor_a_random_trial(tmp_path, monkeypatch):
@@ -148,7 +148,7 @@ def test_noise_is_neither_a_plan_nor_a_random_trial(tmp_path, monkeypatch):
     monkeypatch.setattr(report.figures, "exploration", exploration)
     text, _ = report_of(tmp_path / "runs")
     assert drawn == [([], ["pink-noise"])]
-    assert "mean of 1 trials: forward -1.0" in text
+    assert "mean of 1 trials of 10 steps: forward -1.0" in text
 
 
 def test_a_variant_is_a_row_of_its_own(plain, out):
@@ -160,9 +160,25 @@ def test_a_variant_is_a_row_of_its_own(plain, out):
     write_run(folder, rows, **config, task_planner={"horizon": 2})
     text, again = report_of(out)
     assert again == table and "## Variants" not in before
-    assert "| short | epistemic | 3 | 0 1 2 | 60 ± 26<br>[" in text
+    assert "| short | epistemic | 3 |  | 0 1 2 | 60 ± 26<br>[" in text
     assert "| epistemic, short | epistemic | -540 [" in text
     assert "Unequal settings" not in text
+
+
+def test_returns_of_trials_of_other_lengths_are_told_apart(tmp_path):
+    run = write_arm(tmp_path, "epistemic", [400.0, 500.0], task_length=20)
+    config = {"phase": "zero-shot", "arm": "epistemic"}
+    for tag, length in (("long", 30), ("same", 20), ("untold", None)):
+        rows = zero_shot_rows("epistemic", [40.0, 50.0])
+        told = {"task_length": length} if length else {}
+        write_run(run / f"zero-shot-003-{tag}", rows, **config, **told, tag=tag)
+    text, _ = report_of(tmp_path)
+    assert "the return of a trial of 20 steps under" in text
+    assert "trials of 10 steps: forward" in text
+    assert "A trial has 10 steps on the left and 20 on the right." in text
+    for name, length in (("long", "30"), ("same", "20"), ("untold", "")):
+        assert f"| {name} | epistemic | 3 | {length} | 0 1 |" in text
+        assert (f"| epistemic, {name} | epistemic |" in text) == (name != "long")
 
 
 def test_fine_tuning_of_a_variant_is_a_column_of_its_own(out):
