@@ -29,6 +29,7 @@ from experiments import exploration
 from experiments.build import build
 from experiments.errors import RunError
 from experiments.storage.folder import RunFolder
+from experiments.storage.rundir import HALF_CHEETAH
 from jaxpets.envs import half_cheetah
 
 COLUMNS = (
@@ -43,8 +44,9 @@ Imagine = Callable[[Array, Array, Array], tuple[Array, dict[str, Array]]]
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every rollout and reward."""
-    starts, scale = states(RunFolder(args.run).trajectories, args.states)
     params, size = explored(args.run, workloads.chosen_size(args))
+    starts, scale = states(RunFolder(args.run).trajectories, args.states)
+    workloads.optimizer(size, "cem")  # refuses more elites than candidates
     exact = imagine(params, size, "f32")
     for name in args.rollout:
         other = exact if name == "moved" else imagine(params, size, name)
@@ -110,6 +112,9 @@ def _explored(
 ) -> tuple[jaxpets.EnsembleParams, workloads.Size]:
     run = RunFolder(folder)
     config = exploration.config_of(run)
+    if config.env != HALF_CHEETAH:
+        known = f"its robot is {config.env}, and only {HALF_CHEETAH} is compared"
+        raise RunError(known)  # whose text is printable, if a stranger's is not
     num_members = config.model.num_members
     if num_members < 2 or search.num_particles % num_members:
         raise SystemExit(
@@ -118,7 +123,9 @@ def _explored(
         )
     if config.model.state_margin != jaxpets.EnsembleConfig().state_margin:
         raise SystemExit(f"{folder} has its own --model.state-margin")
-    template = exploration.model_of(exploration.template(config, build(config)))
+    # A file of tasks or of an objective has no part in what the model predicts.
+    parts = build(exploration.without_files(config, None, folder))
+    template = exploration.model_of(exploration.template(config, parts))
     found = run.restore(template)
     if found is None:
         raise SystemExit(f"there is no checkpoint in {folder}")
@@ -189,7 +196,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--rollout", nargs="+", choices=ROLLOUTS,
                         default=["moved", "bf16"], help="what to compare")  # fmt: skip
     parser.add_argument("--states", type=rows.positive, default=8, help="to start from")
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     return rows.report(run(args), COLUMNS, args.json)
 
 

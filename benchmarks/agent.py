@@ -197,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--reward", choices=workloads.REWARDS, default="task")
     parser.add_argument("--means", action="store_true", help="draw no noise")
     parser.add_argument("--policy", action="store_true", help="a policy, not a plan")
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     if args.policy:
         plans = vars(args).keys() - {"policy", "json", "repeats", "tiny"}
         if others := [x for x in plans if getattr(args, x) != parser.get_default(x)]:

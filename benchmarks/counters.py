@@ -134,6 +134,11 @@ def _shares(parts: Counter[str], but: str = "") -> dict[str, float]:
     return {x: round(y / total, 4) for x, y in largest}
 
 
+@rows.refused(OSError, ValueError)
+def _lines(page: Path) -> list[str]:
+    return page.read_text().splitlines()
+
+
 def _row(args: argparse.Namespace, size: workloads.Size) -> Iterator[dict[str, Any]]:
     own: dict[str, Any] = {"seeds": args.seeds, "engine": args.engine}
     if args.kernel == "fit":
@@ -142,9 +147,9 @@ def _row(args: argparse.Namespace, size: workloads.Size) -> Iterator[dict[str, A
     else:
         own |= {**dataclasses.asdict(size), "precision": "bf16"}
     row = rows.make_row("counters", own, kernel=args.kernel)
-    row |= counters(args.read.read_text().splitlines())
+    row |= counters(_lines(args.read))
     if args.source:
-        row["code"] = code(args.source.read_text().splitlines())
+        row["code"] = code(_lines(args.source))
     yield row
 
 
@@ -153,7 +158,9 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="append the row to this file")
+    parser.add_argument(
+        "--json", type=rows.appendable, help="append the row to this file"
+    )
     parser.add_argument("--tiny", action="store_true", help="a toy size")
     workloads.add_size_flag(parser)
     parser.add_argument("--kernel", choices=["rollout", "fit"], default="rollout")
@@ -161,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--seeds", type=rows.positive, default=1)
     parser.add_argument("--read", type=Path, help="a page of raw numbers of one launch")
     parser.add_argument("--source", type=Path, help="its page of instructions")
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     if args.kernel == "fit" and args.engine != "kernel":
         parser.error("--engine is of rollouts: one kernel trains")
     if not args.read and (args.json or args.source):

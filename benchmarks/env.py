@@ -30,13 +30,14 @@ FRAME_SKIP = 5
 
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every engine and batch size, then one for the plain loop."""
-    steps = 3 if args.tiny else args.steps
     for engine, build in ENGINES.items():
         env = build()
-        for batch in [1] if args.tiny else args.batch:
-            result = timing.repeat(*env_call(env, batch, steps), repeats=args.repeats)
-            yield env_row(engine, batch, steps, result)
-    steps *= 20  # so that a run of the fastest is not over at once
+        for batch in args.batch:
+            result = timing.repeat(
+                *env_call(env, batch, args.steps), repeats=args.repeats
+            )
+            yield env_row(engine, batch, args.steps, result)
+    steps = 20 * args.steps  # so that a run of the fastest is not over at once
     result = timing.repeat(loop_call(steps), repeats=args.repeats)
     yield env_row("mujoco-loop", 1, steps, result)
 
@@ -101,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--steps", type=rows.positive, default=50, help="environment steps per run"
     )
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, batch=[1], steps=3)
     return rows.report(run(args), COLUMNS, args.json)
 
 

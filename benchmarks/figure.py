@@ -52,6 +52,11 @@ def plans(rows: Iterable[Row]) -> list[Row]:
         and not row["sizes"].get("chunk_size")
         and row["sizes"].get("plans", 1) == 1
     ]
+    if not found:
+        raise ValueError(
+            "there are no rows of plans by CEM in bf16 at the paper's size, of which "
+            "those of one device are drawn."
+        )
     devices = sorted({row["device"] for row in found})
     if len(devices) != 1:
         raise ValueError(f"rows of plans must be of one device, got {devices}.")

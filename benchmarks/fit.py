@@ -19,9 +19,8 @@ COLUMNS = ("engine", "seeds", "rows", "capacity", "updates", "compile_s", "min_m
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every engine and number of seeds."""
     size = workloads.named_size("tiny" if args.tiny else "paper")
-    num_rows = 100 if args.tiny else args.rows
-    capacity = max(num_rows, args.capacity or 0)
-    updates = args.epochs * -(-num_rows // args.batch_size)
+    capacity = max(args.rows, args.capacity or 0)
+    updates = args.epochs * -(-args.rows // args.batch_size)
     fitters = {
         engine: workloads.fitter(size, args.epochs, args.batch_size, engine)
         for engine in args.engine
@@ -30,7 +29,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         fitter = fitters[engine]
         keys = jax.random.split(jax.random.key(0), seeds)
         params, state, data = workloads.prepare_fit(
-            size, fitter, keys, num_rows, capacity
+            size, fitter, keys, args.rows, capacity
         )
         result = timing.measure(
             workloads.fit_seeds(fitter), params, keys, state, data, repeats=args.repeats
@@ -38,7 +37,7 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         sizes = {
             "engine": engine,
             "seeds": seeds,
-            "rows": num_rows,
+            "rows": args.rows,
             "capacity": capacity,
             "updates": updates,
             "batch_size": args.batch_size,
@@ -65,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     )
     parser.add_argument("--epochs", type=rows.positive, default=5)
     parser.add_argument("--batch-size", type=rows.positive, default=32)
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, rows=100)
     return rows.report(run(args), COLUMNS, args.json)
 
 

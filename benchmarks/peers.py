@@ -47,7 +47,7 @@ class Program(NamedTuple):
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row per program, when all have run in turn."""
     programs = [
-        ours("tiny" if args.tiny else size, engine, precision)
+        ours(size, engine, precision)
         for size in args.size
         for engine in args.engine
         for precision in args.precision
@@ -220,7 +220,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
                         default=["scan"], help="of jaxpets' plans")  # fmt: skip
     parser.add_argument("--precision", nargs="+", choices=workloads.PRECISIONS,
                         default=["f32"], help="of jaxpets' plans")  # fmt: skip
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size=["tiny"])
     if args.tdmpc2 is None and args.hydrax is None:
         parser.error("ask for --tdmpc2, --hydrax or both")
     return rows.report(run(args), COLUMNS, args.json)

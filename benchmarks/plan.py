@@ -173,7 +173,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--gemm", action="store_true", help="compare with bare matrix products"
     )
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     return rows.report(run(args), COLUMNS, args.json)
 
 

@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser = rows.parser(__doc__)
     workloads.add_size_flag(parser)
     parser.set_defaults(size="laptop")
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     return rows.report(run(args), COLUMNS, args.json)
 
 

@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     )
     parser.add_argument("--engine", nargs="+", choices=workloads.ENGINES,
                         default=["scan"], help="what imagines")  # fmt: skip
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     return rows.report(run(args), COLUMNS, args.json)
 
 

@@ -1,6 +1,7 @@
 """What a benchmark reports: a table on the screen, and rows of JSON in a file."""
 
 import argparse
+import contextlib
 import datetime
 import functools
 import importlib.metadata
@@ -9,7 +10,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +69,39 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     flags = argparse.ArgumentParser(
         description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    flags.add_argument("--json", type=Path, help="append rows to this file, as JSONL")
+    flags.add_argument(
+        "--json", type=appendable, help="append rows to this file, as JSONL"
+    )
     flags.add_argument("--repeats", type=positive, default=10, help="measured runs")
     flags.add_argument(
-        "--tiny", action="store_true", help="toy sizes, to see that it runs"
+        "--tiny", action="store_true", help="toy sizes, but for those that are said"
     )
     return flags
+
+
+def parse(
+    flags: argparse.ArgumentParser, argv: Sequence[str] | None, **toys: Any
+) -> argparse.Namespace:
+    """Returns what was said; with `--tiny` toys stand in for what was not."""
+    args = flags.parse_args(argv)
+    if args.tiny:
+        flags.set_defaults(**toys)
+        args = flags.parse_args(argv)
+    return args
+
+
+@contextlib.contextmanager
+def refused(*errors: type[Exception]) -> Iterator[None]:
+    """Ends with one line and code 2, as argparse does, for values that cannot be.
+
+    It is for what is built or read of flags, and not for what is timed: an error of
+    that is a bug, whose trace is wanted.
+    """
+    try:
+        yield
+    except errors as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
 
 
 def positive(text: str) -> int:
@@ -82,6 +110,19 @@ def positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {number}")
     return number
+
+
+def appendable(text: str) -> Path:
+    """Parses the name of a file that can be appended to, and does not make it."""
+    path = os.path.realpath(text)
+    folder = os.path.dirname(path)
+    if os.path.isdir(path):
+        raise argparse.ArgumentTypeError(f"{path} is a folder")
+    if not os.path.isdir(folder):
+        raise argparse.ArgumentTypeError(f"there is no folder {folder}")
+    if not os.access(path if os.path.exists(path) else folder, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{path} cannot be written to")
+    return Path(text)
 
 
 @functools.cache

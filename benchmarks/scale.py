@@ -33,7 +33,13 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     size = workloads.chosen_size(args)
     samples = args.num_samples or 16 * size.num_samples
     large = dataclasses.replace(size, num_samples=samples)
-    counts = [count for count in args.devices if count <= len(jax.devices())]
+    there = len(jax.devices())
+    counts = [count for count in args.devices if count <= there]
+    if not counts:
+        least = min(args.devices)
+        raise SystemExit(
+            f"--devices must be at most {there}, all there are, got {least}"
+        )
     for count in counts:
         yield seeds(size, count, args)
     for count in counts:
@@ -144,7 +150,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--num-samples", type=rows.positive, help="of the large plan; default 16 plans"
     )
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     return rows.report(run(args), COLUMNS, args.json)
 
 

@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser = rows.parser(__doc__)
     workloads.add_size_flag(parser)
     parser.add_argument("--seeds", nargs="+", type=rows.positive, default=[1, 4])
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny")
     done = rows.report(run(args), COLUMNS, args.json)
     for row in done:
         print(f"{row['sizes']['seeds']} seeds, us and launches per plan:")

@@ -21,21 +21,18 @@ COLUMNS = ("engine", "precision", "seeds", "steps", "rows", "compile_s", "unroll
 def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields a row for every number of seeds."""
     size = workloads.chosen_size(args)
-    steps = 3 if args.tiny else args.steps
-    num_rows = 100 if args.tiny else args.rows
-    repeats = min(args.repeats, 2) if args.tiny else args.repeats
     for seeds in args.seeds:
         keys = jax.random.split(jax.random.key(0), seeds)
-        act = time_unroll(size, args, keys, steps, repeats)
-        learn = time_fit(size, keys, num_rows, repeats)
+        act = time_unroll(size, args, keys)
+        learn = time_fit(size, keys, args.rows, args.repeats)
         sizes = {
             **dataclasses.asdict(size),
             "engine": args.engine,
             "precision": args.precision,
             "optimizer": args.optimizer,
             "seeds": seeds,
-            "steps": steps,
-            "rows": num_rows,
+            "steps": args.steps,
+            "rows": args.rows,
         }
         yield rows.make_row(
             "trial",
@@ -44,22 +41,18 @@ def run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             min_ms=act.min_ms + learn.min_ms,
             median_ms=act.median_ms + learn.median_ms,
             p99_ms=act.p99_ms + learn.p99_ms,
-            repeats=repeats,
+            repeats=args.repeats,
             unroll_s=act.median_ms / 1e3,
-            ms_per_step=act.median_ms / steps,
+            ms_per_step=act.median_ms / args.steps,
             fit_s=learn.median_ms / 1e3,
             trial_s=(act.median_ms + learn.median_ms) / 1e3,
         )
 
 
 def time_unroll(
-    size: workloads.Size,
-    args: argparse.Namespace,
-    keys: jax.Array,
-    steps: int,
-    repeats: int,
+    size: workloads.Size, args: argparse.Namespace, keys: jax.Array
 ) -> timing.Timing:
-    """Times reset and `steps` steps of planning and acting."""
+    """Times reset and `--steps` steps of planning and acting."""
     env = ENGINES[args.engine]()
     planner = workloads.planner(size, args.precision, args.optimizer)
     prepare = jax.vmap(lambda key: workloads.plan_params(size, key, "epistemic"))
@@ -68,9 +61,10 @@ def time_unroll(
     def act(params: jaxpets.PlanParams, key: jax.Array) -> jaxpets.Transition:
         reset_key, act_key = jax.random.split(key)
         state = jaxpets.start_trial(env, planner, reset_key)
-        return jaxpets.unroll(env, planner, params, act_key, state, length=steps)[1]
+        length = args.steps
+        return jaxpets.unroll(env, planner, params, act_key, state, length=length)[1]
 
-    return timing.measure(jax.vmap(act), params, keys, repeats=repeats)
+    return timing.measure(jax.vmap(act), params, keys, repeats=args.repeats)
 
 
 def time_fit(
@@ -101,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument(
         "--rows", type=rows.positive, default=30_000, help="of data to train on"
     )
-    args = parser.parse_args(argv)
+    args = rows.parse(parser, argv, size="tiny", steps=3, rows=100)
     return rows.report(run(args), COLUMNS, args.json)
 
 

@@ -82,7 +82,7 @@ def add_size_flag(parser: argparse.ArgumentParser, *more: str) -> None:
 
 def chosen_size(args: argparse.Namespace, *more: str) -> Size:
     """Returns the size that the flags ask for, with `more` as `add_size_flag` had."""
-    size = named_size("tiny" if args.tiny else args.size)
+    size = named_size(args.size)
     others = {name: getattr(args, name, None) for name in (*_OTHERS, *more)}
     return dataclasses.replace(size, **{x: n for x, n in others.items() if n})
 
@@ -107,6 +107,7 @@ def model(size: Size, precision: str) -> jaxpets.Ensemble:
     )
 
 
+@rows.refused(ValueError)
 def rollout_fn(
     size: Size, precision: str, engine: str = "scan"
 ) -> jaxpets.typing.RolloutFn:
@@ -121,6 +122,7 @@ def rollout_fn(
     return kernel_of(model(size, precision), precision, size.num_particles, arch)
 
 
+@rows.refused(ValueError)
 def kernel_of(
     model: jaxpets.Ensemble, precision: str, num_particles: int, arch: str | None
 ) -> jaxpets.typing.FusedRollout:
@@ -156,6 +158,7 @@ def rollout_work(
     return rollout_fn(size, precision, engine), (start, key, obs, actions)
 
 
+@rows.refused(ValueError)
 def optimizer(
     size: Size, name: str, engine: str = "scan"
 ) -> jaxpets.optimizers.TrajectoryOptimizer:

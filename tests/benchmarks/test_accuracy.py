@@ -173,6 +173,33 @@ def test_models_that_cannot_be_compared_are_refused(performed, tmp_path, changes
         accuracy.explored(tmp_path, SIZE)
 
 
+@pytest.mark.parametrize("env", ["pets/pusher", "own.py:robot"])
+def test_another_robot_is_refused_first(performed, tmp_path, env):
+    config = json.loads((performed / "config.json").read_text()) | {"env": env}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(SystemExit) as caught:
+        accuracy.main([str(tmp_path), "--tiny"])
+    assert str(caught.value) == (
+        f"cannot read {tmp_path}: its robot is {env}, and only pets/half_cheetah is "
+        "compared"
+    )
+
+
+def test_files_of_tasks_and_objectives_are_not_needed(performed, tmp_path):
+    config = json.loads((performed / "config.json").read_text())
+    config |= {"tasks": "mine.py", "arm": "mine.py:seek"}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "checkpoints").symlink_to(performed / "checkpoints")
+    params, size = accuracy.explored(tmp_path, SIZE)
+    assert size == accuracy.explored(performed, SIZE)[1] and params is not None
+
+
+def test_more_elites_than_candidates_are_refused(performed, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        accuracy.main([str(performed), "--tiny", "--num-elites", "17"])
+    assert "num_samples must be at least num_elites" in capsys.readouterr().err
+
+
 def test_no_folder_is_refused(tmp_path):
     with pytest.raises(SystemExit, match="cannot read"):
         accuracy.explored(tmp_path / "nothing", SIZE)

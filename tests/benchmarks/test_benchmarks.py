@@ -12,13 +12,16 @@ import pytest
 from benchmarks import (
     agent,
     costs,
+    counters,
     env,
     fit,
     model_quality,
+    peers,
     plan,
     ratios,
     real_data,
     rollout,
+    scale,
     shapes,
     timing,
     trace,
@@ -402,6 +405,88 @@ def test_bad_usage(capsys):
             program.main(flags.split())
         assert caught.value.code == 2
         assert message in capsys.readouterr().err
+
+
+def test_a_file_that_rows_cannot_go_to_is_refused_first(tmp_path, capsys, monkeypatch):
+    (path := tmp_path / "rows.jsonl").touch()
+    monkeypatch.setattr(plan, "run", lambda args: pytest.fail("it measures"))
+    for file, message in [
+        (tmp_path, "is a folder"),
+        (tmp_path / "none" / "rows.jsonl", "there is no folder"),
+        (path / "rows.jsonl", "there is no folder"),
+        (path, "cannot be written to"),
+        (tmp_path / "new.jsonl", "cannot be written to"),
+    ]:
+        if message == "cannot be written to":  # which root always can
+            monkeypatch.setattr(rows_module.os, "access", lambda *_: False)
+        with pytest.raises(SystemExit) as caught:
+            plan.main(["--tiny", "--json", str(file)])
+        assert caught.value.code == 2
+        assert message in capsys.readouterr().err
+    monkeypatch.undo()
+    assert rows_module.appendable(str(path)) == path
+    assert rows_module.appendable(str(new := tmp_path / "new.jsonl")) == new
+    assert not new.exists()
+
+
+@pytest.mark.parametrize(
+    ("program", "flags", "said", "toys"),
+    [
+        (fit, "--rows 7", {"rows": 7}, {"rows": 100}),
+        (env, "--batch 2 3", {"batch": [2, 3]}, {"batch": [1], "steps": 3}),
+        (env, "--steps 50", {"steps": 50}, {"batch": [1], "steps": 3}),
+        (trial, "--steps 4 --repeats 3", {"steps": 4, "repeats": 3}, {"rows": 100}),
+        (trial, "--rows 9", {"rows": 9}, {"rows": 100, "steps": 3, "size": "tiny"}),
+        (plan, "--size paper", {"size": "paper"}, {"size": "tiny"}),
+        (peers, "--hydrax .", {}, {"size": ["tiny"]}),
+    ],
+)
+def test_what_is_said_wins_over_toy_sizes(monkeypatch, program, flags, said, toys):
+    seen = []
+    monkeypatch.setattr(program, "run", lambda args: seen.append(vars(args)) or [])
+    for tiny in ["--tiny", *flags.split()], [*flags.split(), "--tiny"]:
+        program.main(tiny)
+        assert seen.pop().items() >= (toys | said).items()
+    program.main(flags.split())
+    assert not toys.items() <= seen.pop().items()
+
+
+@pytest.mark.parametrize(
+    ("program", "flags", "message"),
+    [
+        (plan, "--num-elites 500", "num_samples must be at least num_elites, 500"),
+        (plan, "--num-particles 7", "num_particles must be a multiple"),
+        (shapes, "--arch volta --precision f32", "arch must be the name of a GPU"),
+        (counters, "--read nowhere.csv", "No such file or directory: 'nowhere.csv'"),
+        (model_quality, "--ours --data .", "Is a directory: '.'"),
+    ],
+)
+def test_sizes_and_files_that_cannot_be_end_with_one_line(
+    capsys, program, flags, message
+):
+    with pytest.raises(SystemExit) as caught:
+        program.main(["--tiny", *flags.split()])
+    assert caught.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and message in line
+
+
+def test_an_error_of_what_is_timed_is_not_refused(monkeypatch):
+    def broken(*_):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr(plan.timing, "compile_program", broken)
+    with pytest.raises(ValueError, match="a bug"):
+        plan.main(["--tiny", "--seeds", "1"])
+
+
+def test_devices_that_are_not_there_are_left_out_unless_all_are(monkeypatch):
+    monkeypatch.setattr(scale, "seeds", lambda size, count, args: count)
+    monkeypatch.setattr(scale, "candidates", lambda size, count, args: -count)
+    monkeypatch.setattr(scale.rows, "report", lambda found, *_: list(found))
+    assert scale.main(["--tiny", "--devices", "1", "999"]) == [1, -1]
+    with pytest.raises(SystemExit, match=r"--devices must be at most .*, got 998"):
+        scale.main(["--tiny", "--devices", "998", "999"])
 
 
 def test_a_trace_is_summed_over_the_streams_of_the_gpu():

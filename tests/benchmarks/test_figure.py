@@ -163,7 +163,11 @@ def test_program_writes_other_formats_too(tmp_path):
 
 def test_bad_usage(tmp_path, capsys):
     empty = written(tmp_path / "rows.jsonl", [])
-    for path, message in [(empty, "one device"), (tmp_path / "no", "No such file")]:
+    for path, message in [
+        (empty, "one device"),
+        (empty, "there are no rows of plans by CEM in bf16"),
+        (tmp_path / "no", "No such file"),
+    ]:
         with pytest.raises(SystemExit) as caught:
             figure.main([str(path), "--out", str(tmp_path / "plan.svg")])
         assert caught.value.code == 2
