@@ -1,6 +1,8 @@
 """`python -m experiments.sweep SWEEP.toml`: a grid of runs with all their phases."""
 
 import argparse
+import contextlib
+import ctypes
 import os
 import queue
 import signal
@@ -16,6 +18,7 @@ from typing import Any
 from . import calling, grid, remaining, robots, run, signals, status
 from .errors import (
     InterruptedRun,
+    RunEnd,
     RunError,
     UsageError,
     last_line,
@@ -61,6 +64,7 @@ and flags one by one, everything else as a whole.
 
 The same command continues a sweep: it leaves out what is complete."""
 _POLL = 0.5  # seconds
+_PR_SET_PDEATHSIG = 1  # of prctl, in <linux/prctl.h>
 
 
 class _Phases:
@@ -99,10 +103,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="show the runs, start none")
     parser.add_argument("--slurm", action="store_true", help="run jobs of SLURM")
     parser.add_argument("--run", help="do this run alone, here; jobs call it")
+    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.jobs is not None and args.jobs < 1:
         parser.error(f"--jobs {args.jobs} is not valid; it must be 1 or more.")
     try:
+        if args.parent is not None:
+            _end_with(args.parent)
         sweep = grid.read(args.file)
         jobs = [job for job in remaining.named(sweep) if args.only in job.name]
         if not jobs:
@@ -121,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = [sys.executable, "-m", module, str(args.file), "--run"]
         start = _on_slurm if args.slurm else _here
         code = start(sweep, left, command, args.jobs)
-    except RunError as error:
+    except RunEnd as error:
         signals.say(last_line(error))
         return error.exit_code
     status.main([sweep.out])
@@ -134,6 +141,27 @@ def _run(jobs: Sequence[Job], name: str) -> int:
         if job.name == name:
             return next(filter(None, map(run.main, job.commands)), 0)
     raise UsageError(f"--run {name} is not valid; there is no such run.")
+
+
+def _end_with(parent: int) -> None:
+    """Has the end of the sweep that started this run be a SIGHUP to it; on Linux.
+
+    A sweep that is killed stops no run, and this one would keep its folder from the
+    same command. The kernel signals as each thread of the sweep ends: of the signals
+    that stop a run only a SIGHUP may come again.
+
+    Raises:
+      InterruptedRun: if the sweep is gone already.
+    """
+    if sys.platform != "linux":
+        return
+    # A sweep under nohup would have it ignored; this session has no terminal.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    # The first of these threads is that of `_here`, which waits for this run.
+    libc = ctypes.CDLL(None)
+    libc.prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGHUP))
+    if os.getppid() != parent:
+        raise InterruptedRun("the sweep that has started it is gone")
 
 
 def _here(
@@ -169,7 +197,7 @@ def _here(
     def started(job: Job, log: Path, device: str | None) -> int:
         with disk.opened(log, os.O_WRONLY | os.O_APPEND) as file:
             process = subprocess.Popen(
-                [*command, job.name],
+                [*command, job.name, "--parent", str(os.getpid())],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=_environment(device, shared),
@@ -248,8 +276,19 @@ def _ended(job: Job, task: Any) -> int:
 def _told(job: Job, code: int, log: Path, after: str = "") -> int:
     """Says how a run has ended; returns its exit code."""
     how = "complete" if code == 0 else f"exit code {code}, see {log}"
-    print(f"{job.name}: {how}{after}", flush=True)
+    # Another end leaves no such line, but the log may have one of an earlier start.
+    why = _error(log) if 1 < code < InterruptedRun.exit_code else ""
+    print(f"{job.name}: {how}{after}{why}", flush=True)
     return code
+
+
+def _error(log: Path) -> str:
+    """Returns the last error that a log tells of, behind which another may write."""
+    lines: list[str] = []
+    with contextlib.suppress(OSError):
+        lines = log.read_text(errors="replace").splitlines()
+    told = (f"  {line}" for line in reversed(lines) if line.startswith("error: "))
+    return next(told, "")
 
 
 if __name__ == "__main__":

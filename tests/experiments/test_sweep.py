@@ -303,6 +303,83 @@ def test_a_signal_stops_those_that_run_and_starts_no_other(file, tmp_path, whom)
     assert not (own / "b").exists() and not (own / "c").exists()
 
 
+ORPHAN = """
+import sys, time
+from experiments import signals, sweep
+from experiments.errors import InterruptedRun
+sweep._end_with(int(sys.argv[3]))
+with signals.stoppable():
+    try:
+        open(sys.argv[1], "w").close()
+        time.sleep(60)
+    except InterruptedRun:
+        time.sleep(0.5)  # in which a second signal would end it
+        open(sys.argv[1] + "-stopped", "w").close()
+"""
+# Under nohup, and with many threads, as the end of each may signal the run.
+NOHUP = """
+import signal, threading, time
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+for _ in range(50):
+    threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the run")
+def test_a_sweep_that_is_killed_stops_its_run(file, tmp_path):
+    """As any signal does, in its own time."""
+    own = tmp_path / "started"
+    own.mkdir()
+    env = os.environ | {"PYTHONPATH": str(Path(grid.__file__).parents[1])}
+    arguments = ["-c", NOHUP + HERE, str(file(FILE)), str(own), ORPHAN]
+    with subprocess.Popen([sys.executable, *arguments], env=env) as process:
+        while not (own / "a").exists() and process.poll() is None:
+            time.sleep(0.05)
+        process.kill()
+    late = time.monotonic() + 30  # it takes none; a run that goes on takes 60
+    while not (own / "a-stopped").exists() and time.monotonic() < late:
+        time.sleep(0.05)
+    assert (own / "a-stopped").exists()
+
+
+def test_a_run_ends_with_the_sweep_that_started_it(file, monkeypatch, capsys):
+    known = []
+    monkeypatch.setattr(sweep, "_end_with", known.append)
+    monkeypatch.setattr(sweep.run, "main", lambda argv: 0)
+    command = [str(file(FILE)), "--run", "random"]
+    assert sweep.main(command) == 0 and not known  # by hand it outlives a shell
+    assert sweep.main([*command, "--parent", "5"]) == 0 and known == [5]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the run")
+def test_a_run_whose_sweep_is_gone_already_does_not_begin(file):
+    """In a process of its own, whose parent is this one and not the first of all."""
+    env = os.environ | {"PYTHONPATH": str(Path(grid.__file__).parents[1])}
+    command = [sys.executable, "-m", "experiments.sweep", str(file(FILE))]
+    command += ["--run", "random", "--parent", "1"]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (75, "")
+    assert done.stderr.startswith("stopped: the sweep that has started it is gone; ")
+
+
+def test_a_sweep_says_the_error_of_a_run(file, tmp_path, capsys):
+    """Though another process writes to the same log, which has errors of before."""
+    code = """if 1:
+        import sys
+        print("error: x is in use by pid 7.\\n5/20 of another", file=sys.stderr)
+        sys.exit(int(sys.argv[1]))
+    """
+    table, command = grid.read(file(FILE)), [sys.executable, "-c", code]
+    (tmp_path / "runs" / "logs").mkdir(parents=True)
+    (tmp_path / "runs" / "logs" / "3.txt").write_text("error: of an earlier start\n")
+    left = [Job(name, []) for name in ("3", "75", "1")]
+    assert sweep._here(table, left, command, 1) == 3
+    locked, stopped, bug = capsys.readouterr().out.splitlines()
+    assert locked.startswith("3: exit code 3, see ")
+    assert locked.endswith(" s  error: x is in use by pid 7.")
+    assert stopped.endswith(" s") and bug.endswith(" s")
+
+
 def test_a_run_that_cannot_be_started_does_not_keep_the_others(file, tmp_path, capsys):
     table = grid.read(file(FILE))
     logs = tmp_path / "runs" / "logs"
