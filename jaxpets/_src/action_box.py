@@ -59,7 +59,9 @@ def _check(action_low: ArrayLike, action_high: ArrayLike) -> None:
     for name, bound in zip(("action_low", "action_high"), bounds, strict=True):
         if not isinstance(bound, (Array, np.ndarray)) or bound.dtype.kind not in "fiu":
             kind = getattr(bound, "dtype", type(bound).__name__)
-            raise TypeError(f"{name} must be numbers [A], got {bound!r} ({kind}).")
+            raise TypeError(
+                f"{name} must be an array of numbers [A], got {bound!r} ({kind})."
+            )
     shape = jnp.shape(action_low)
     if len(shape) != 1 or shape[0] == 0:
         raise ValueError(f"action_low must be [A] with A > 0, got {list(shape)}.")

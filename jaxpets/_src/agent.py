@@ -160,7 +160,7 @@ class Agent:
         With another reward of the same structure nothing is compiled again.
 
         Args:
-          reward: `PlanParams.reward`, any pytree of numbers.
+          reward: `PlanParams.reward`, any pytree of numbers; floats become float32.
           planner: plans for the task; None for the one that explores.
 
         Raises:

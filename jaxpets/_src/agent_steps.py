@@ -100,9 +100,10 @@ def act_fn(planner: Planner, action_size: int, num_envs: int | None) -> ActFn:
 
 
 def strongly_typed(tree: Any) -> Any:
-    """Returns numbers, copied, as arrays of their own type.
+    """Returns numbers, copied, as arrays of their own type, and floats as float32.
 
-    With a type of Python's they would compile anew.
+    With a type of Python's they would compile anew, and with 64 bits give those to a
+    reward.
 
     Raises:
       TypeError: for what is none, as a reward's function in place of its data.
@@ -112,6 +113,8 @@ def strongly_typed(tree: Any) -> Any:
         dtype = leaf.dtype if isinstance(leaf, Array) else np.asarray(leaf).dtype
         if not any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_)):
             raise TypeError(f"reward must be a pytree of numbers, got {leaf!r} in it.")
-        return jnp.array(leaf, jax.dtypes.canonicalize_dtype(dtype))
+        is_float = jnp.issubdtype(dtype, np.floating)
+        wanted = jnp.float32 if is_float else jax.dtypes.canonicalize_dtype(dtype)
+        return jnp.array(leaf, wanted)
 
     return jax.tree.map(array, tree)

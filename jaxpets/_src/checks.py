@@ -53,19 +53,23 @@ def check_flag(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be True or False, got {value!r}.")
 
 
-def check_real(name: str, value: Any, low: float, high: float = math.inf) -> float:
+def check_real(
+    name: str, value: Any, low: float, high: float = math.inf, *, above: bool = False
+) -> float:
     """Returns `value`, a finite number in `[low, high]`, as a Python number, or raises.
 
     What float32 does not hold is not finite. A Python number takes the type of what it
-    meets; NumPy's of 64 bits would give its own to it under x64.
+    meets; NumPy's of 64 bits would give its own to it under x64. With `above` it must
+    be more than low, and has no high.
     """
     if isinstance(value, bool) or not _is_number(value):
         kind = type(value).__name__
         raise TypeError(f"{name} must be a Python float, got {value!r} ({kind}).")
-    if not (abs(value) <= _LARGEST and low <= value <= high):
+    is_low = value <= low if above else value < low
+    if is_low or not (abs(value) <= _LARGEST and value <= high):
         valid = f"in [{low:g}, {high:g}]"
         if high == math.inf:
-            valid = f"finite and at least {low:g}"
+            valid = f"finite and {'more than' if above else 'at least'} {low:g}"
         raise ValueError(f"{name} must be {valid}, got {value!r}.")
     return value.item() if isinstance(value, (np.float64, np.integer)) else value
 

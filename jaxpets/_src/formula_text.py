@@ -109,7 +109,9 @@ def _is_taken(word: str) -> bool:
     return word in own or is_action or keyword.iskeyword(word)
 
 
-def parse(text: str, names: Mapping[str, int], action_size: int = 0) -> Formula:
+def parse(
+    text: str, names: Mapping[str, int], action_size: int | None = None
+) -> Formula:
     """Returns the formula that a line of text means. Nothing is evaluated.
 
     A formula has numbers, `pi`, names of entries in the state that is reached,
@@ -130,7 +132,7 @@ def parse(text: str, names: Mapping[str, int], action_size: int = 0) -> Formula:
       text: what somebody types.
       names: words, and the places of their entries in the observation, as `names`
         returns them.
-      action_size: A, for the words `action_0` to `action_{A-1}`.
+      action_size: A, for the words `action_0` to `action_{A-1}`; None for no such word.
 
     Returns:
       What `reward` takes, as data for `PlanParams.reward`.
@@ -146,9 +148,10 @@ def parse(text: str, names: Mapping[str, int], action_size: int = 0) -> Formula:
     """
     if not isinstance(text, str):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"text must be a str, got {text!r}.")
-    action_size = check_count("action_size", action_size, 0)
+    if action_size is not None:
+        action_size = check_count("action_size", action_size)
     words = _places("names", names)
-    actions = {f"action_{i}": i for i in range(action_size)}
+    actions = {f"action_{i}": i for i in range(action_size or 0)}
     try:
         tree = _Reader(words, actions).read(_tree(text))
         return Program().formula(tree)

@@ -201,7 +201,7 @@ def _control_names(model: Any) -> list[str]:
 
 
 def _num_substeps(model: Any, control_step: float, action_repeat: int) -> int:
-    check_real("control_step", control_step, 0.0)
+    check_real("control_step", control_step, 0.0, above=True)
     action_repeat = check_count("action_repeat", action_repeat)
     ratio = control_step / model.opt.timestep
     count = max(1, round(ratio))

@@ -34,7 +34,10 @@ def start_fn(model: Any, reset: ResetFn | Sequence[str] | None) -> StartFn:
         names = [model.key(i).name for i in range(model.nkey)]
         is_names = is_sequence(reset) and all(name in names for name in reset)
         if not (is_names and reset):
-            raise ValueError(f"reset must be keyframes among {names}, got {reset!r}.")
+            wanted = f"keyframes among {names}"
+            if not names:
+                wanted = "None or a function, as the model has no keyframes"
+            raise ValueError(f"reset must be {wanted}, got {reset!r}.")
         chosen = [names.index(name) for name in reset]
         _check_mocap(model, chosen)
         arrays = (model.key_qpos, model.key_qvel, model.key_act)

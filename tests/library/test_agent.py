@@ -14,6 +14,7 @@ from safetensors.numpy import load_file, save_file
 
 import jaxpets
 from jaxpets._src import agent_call
+from jaxpets._src.agent_steps import strongly_typed
 
 ONE = np.ones(1)
 RANDOM = jaxpets.random_planner(-ONE, ONE)
@@ -437,6 +438,19 @@ def test_what_performs_must_be_a_planner(make, trained):
         agent.perform(1.0, 0)
     agent.perform(1.0)
     agent.perform(1.0, PULL)
+
+
+def test_a_task_of_64_bits_is_performed_as_one_of_32(make, trained):
+    with jax.enable_x64(True):
+        agent = make(params=trained)
+        for goal in (0.75, np.array(0.75), jnp.array(0.75)):
+            agent.perform(goal)
+            agent.reset()
+            assert agent.act(at(0.25)) == pytest.approx(0.5)
+        task = strongly_typed({"goal": np.ones(2), "entry": np.int64(3), "on": True})
+    assert {name: str(x.dtype) for name, x in task.items()} == {
+        "goal": "float32", "entry": "int64", "on": "bool",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

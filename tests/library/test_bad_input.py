@@ -300,7 +300,7 @@ WRONG = {
         "env.reset's result must be an EnvState, got"),
     "bounds of actions": (
         lambda: learner(env=ENV._replace(action_low=None)),
-        r"action_low must be numbers \[A\], got None"),
+        r"action_low must be an array of numbers \[A\], got None"),
     "a step that rounds": (
         lambda: unroll(env=ENV._replace(step=rounding_step)),
         r"env.step's result\.obs must be float32\[2\], got float16\[2\]"),

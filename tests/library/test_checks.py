@@ -222,7 +222,8 @@ def test_an_action_box_is_float32_whatever_its_bounds_are(dtype):
 
 @pytest.mark.parametrize("bound", [None, "box", [-1.0], np.array(["a"])])
 def test_an_action_box_is_of_numbers(bound):
-    with pytest.raises(TypeError, match=r"action_low must be numbers \[A\], got"):
+    wanted = r"action_low must be an array of numbers \[A\], got"
+    with pytest.raises(TypeError, match=wanted):
         action_box(bound, np.ones(1))
 
 

@@ -253,8 +253,11 @@ def test_entries_have_words():
 def test_other_arguments_are_checked():
     with pytest.raises(TypeError, match="text must be a str, got 3"):
         formulas.parse(3, {})
-    with pytest.raises(ValueError, match="action_size must be at least 0"):
-        formulas.parse("1", {}, -1)
+    for size in (-1, 0):
+        with pytest.raises(
+            ValueError, match=f"action_size must be at least 1, got {size}"
+        ):
+            formulas.parse("1", {}, size)
     with pytest.raises(ValueError, match="'x'"):
         formulas.parse("x", {"x": -1})
     rows = [Coordinate("a"), Coordinate("b")]

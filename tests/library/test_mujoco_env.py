@@ -319,6 +319,15 @@ BAD = {
     "control_step must be a multiple of the model's 0.002 s, as 0.004, got 0.003": (
         CART, {"control_step": 0.003},
     ),
+    "control_step must be finite and more than 0, got -0.05": (
+        CART, {"control_step": -0.05},
+    ),
+    "control_step must be finite and more than 0, got 0.0": (
+        CART, {"control_step": 0.0},
+    ),
+    "control_step must be finite and more than 0, got nan": (
+        CART, {"control_step": float("nan")},
+    ),
     "settle_time must be a multiple of the 0.02 s of a step, got 0.03": (
         CART, {"control_step": 0.02, "settle_time": 0.03},
     ),
@@ -340,6 +349,9 @@ BAD = {
         CART, {"reset": ("up",)},
     ),
     "reset must be keyframes .* got 'left'": (CART, {"reset": "left"}),
+    "reset must be None or a function, as the model has no keyframes, got .'up',.": (
+        robots.FREE_XML, {"reset": ("up",)},
+    ),
     "reset must be keyframes that leave mocap bodies .* got 'left'": (
         CART.replace("<worldbody>", '<worldbody><body mocap="true"/>').replace(
             'name="left"', 'name="left" mpos="1 2 3"'
