@@ -278,7 +278,7 @@ def _summary(rows: list[dict[str, Any]], names: Sequence[str], seconds: float) -
         planner, *others = (found[name] for found in means)
         shown = [f"{WHO[0]} {planner:6.0f}"]
         for who, mean in zip(WHO[1:], others, strict=True):
-            share = f" ({mean / planner:.0%})" if planner > 0 else ""
+            share = f" ({mean / planner:.0%})" if mean >= 0 < planner else ""
             shown.append(f"{who} {mean:6.0f}{share}")
         lines.append(f"  {name:11} {'  '.join(shown)}")
     also = [*records.diverged(rows), *records.not_finite(rows, names)]

@@ -22,6 +22,9 @@ if TYPE_CHECKING:  # it brings mujoco, which wrong flags need not wait for
     from jaxpets.envs import Robot, Tasks
 
 
+_MJCF = " An MJCF goes into a file of Python: --env FILE.py, with a robot(backend)."
+
+
 def of(config: Config) -> "Robot":
     """Returns the robot of a config, with the tasks of the user's if there are any.
 
@@ -42,7 +45,8 @@ def named(env: str, engine: str, tasks: str | None = None) -> "Robot":
         try:
             robot = envs.make(env, backend=engine)
         except (ImportError, ValueError) as error:
-            raise UsageError(f"--env {env} is not valid; {error}") from error
+            hint = _MJCF if env.endswith(".xml") else ""
+            raise UsageError(f"--env {env} is not valid; {error}{hint}") from error
     if tasks is None:
         return robot
 

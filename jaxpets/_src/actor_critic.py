@@ -26,7 +26,6 @@ from jaxpets._src.checks import (
 )
 from jaxpets._src.imagined_trials import (
     check_imagined,
-    check_members,
     imagine,
     over_trials,
     renewed,
@@ -122,7 +121,6 @@ def actor_critic(
 
     def init(params: PlanParams, key: Array, dataset: Dataset) -> ActorCriticState:
         check_imagined(params, key, dataset, *sizes)
-        check_members(dynamics_fn, params.dynamics, key, rows, *sizes)
         start_key, draw_key, network_key = jax.random.split(key, 3)
         obs, rewards = starts(params.reward, start_key, dataset)
         low, high = reward_range(

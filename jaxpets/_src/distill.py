@@ -25,7 +25,6 @@ from jaxpets._src.distill_trials import build_trials
 from jaxpets._src.distill_update import build_update
 from jaxpets._src.imagined_trials import (
     check_imagined,
-    check_members,
     imagine,
     over_trials,
     reward_range,
@@ -130,7 +129,6 @@ def distill(
 
     def init(params: PlanParams, key: Array, dataset: Dataset) -> DistillState:
         check_imagined(params, key, dataset, *sizes)
-        check_members(dynamics_fn, params.dynamics, key, rows, *sizes)
         start_key, draw_key, network_key, plan_key = jax.random.split(key, 4)
         obs, rewards, planning = trials.fresh(params.reward, start_key, dataset)
         low, high = reward_range(

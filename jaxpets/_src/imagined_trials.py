@@ -178,16 +178,3 @@ def check_imagined(
     check_record("dataset", dataset, Dataset)
     check_array("dataset.data.obs", dataset.data.obs, ["C", obs_size])
     check_array("dataset.data.action", dataset.data.action, ["C", action_size])
-
-
-def check_members(
-    dynamics_fn: DynamicsFn, params: Any, key: Array, rows: tuple[int, int], *sizes: int
-) -> None:
-    """Raises unless a model takes trials `[E, B]`, whose E is said beside it."""
-    obs, action = (jax.ShapeDtypeStruct((*rows, x), jnp.float32) for x in sizes)
-    try:
-        jax.eval_shape(dynamics_fn, params, key, obs, action)
-    except ValueError as error:
-        raise ValueError(
-            f"dynamics_fn must take num_members={rows[0]}, but says: {error}"
-        ) from error

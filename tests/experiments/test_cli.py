@@ -90,6 +90,7 @@ explore --preset paper                  | --preset paper; hours; --allow-cpu
 --phase zero-shot --arm x               | --arm x; one-step
 --env pets/half_cheeta                  | --env pets/half_cheeta; pets/half_cheetah
 --env robots/none.py                    | --env robots/none.py; there is no such file
+--env robots/none.xml                   | --env robots/none.xml; FILE.py, with a robot(
 --arm none.py                           | --arm none.py; or FILE.py:NAME
 --arm none.py:bonus                     | --arm none.py:bonus; there is no such file
 --tasks x.py                            | --tasks x.py; left out in explore

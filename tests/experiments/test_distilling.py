@@ -101,7 +101,10 @@ def test_a_planner_that_earns_nothing_has_no_share():
     ]
     text = distilling._summary(rows, ["hop"], 1.0)
     assert "%" not in text and "policy      3" in text
-    rows[1]["return"] = np.nan
+    rows[0]["return"], rows[1]["return"] = 10.0, -20.0
+    text = distilling._summary(rows, ["hop"], 1.0)
+    assert "policy    -20  both      0 (0%)" in text
+    rows[0]["return"], rows[1]["return"] = 0.0, np.nan
     text = distilling._summary(rows, ["hop"], 1.0)
     assert text.splitlines()[-1].startswith("  the reward of hop is not finite in 1 of")
     rows[0]["lost_steps"] = 7

@@ -459,10 +459,6 @@ def test_wrong_arguments_fail_when_traced():
         learner.init(params, jax.random.key(0), data)
     with pytest.raises(TypeError, match="params must be a PlanParams"):
         learner.init(WORLD, jax.random.key(0), states())
-    model = toys.small_ensemble(num_members=5)
-    learned = params._replace(dynamics=model.init(jax.random.key(0)))
-    with pytest.raises(ValueError, match=r"num_members=1, but says: obs must be .*\[5"):
-        build(dynamics_fn=model.sample).init(learned, jax.random.key(0), states())
     with pytest.raises(TypeError, match=r"params.reward must be a Guided"):
         learner.policy.step(params, jax.random.key(0), (), jnp.zeros(2))
     swapped = params._replace(reward=Guided((), params.reward))

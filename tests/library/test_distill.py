@@ -244,18 +244,6 @@ def test_state_and_members_keep_their_shapes():
     assert toys.avals(after) == toys.avals(state)
 
 
-def test_the_members_are_those_of_the_model():
-    model = toys.small_ensemble(num_members=5)
-    params = PlanParams(jax.eval_shape(model.init, jax.random.key(0)), TARGETS)
-    init = functools.partial(jax.eval_shape, key=jax.random.key(0), dataset=states())
-    chance = jaxpets.random_planner(-toys.LIMIT, toys.LIMIT)
-    of = functools.partial(build, planner=chance, dynamics_fn=model.sample)
-    init(of(num_members=5).init, params)
-    wrong = of(num_members=2)
-    with pytest.raises(ValueError, match=r"num_members=2, but says: obs must be .*\[5"):
-        init(wrong.init, params)
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
