@@ -119,8 +119,8 @@ def steps(rows: Iterable[Row], name: str) -> str:
       name: the entry of their configs: `trial_length` or `task_length`.
     """
     runs = {row.run for row in rows}
-    found = {rundir.find_json(run / rundir.CONFIG).get(name) for run in runs}
-    return " or ".join(map(str, sorted(x for x in found if isinstance(x, int))))
+    told = (rundir.find_json(run / rundir.CONFIG).get(name) for run in runs)
+    return " or ".join(map(str, sorted({x for x in told if isinstance(x, int)})))
 
 
 def named_by_tag(rows: Iterable[Row]) -> list[Row]:

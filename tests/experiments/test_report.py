@@ -168,15 +168,16 @@ def test_a_variant_is_a_row_of_its_own(plain, out):
 def test_returns_of_trials_of_other_lengths_are_told_apart(tmp_path):
     run = write_arm(tmp_path, "epistemic", [400.0, 500.0], task_length=20)
     config = {"phase": "zero-shot", "arm": "epistemic"}
-    for tag, length in (("long", 30), ("same", 20), ("untold", None)):
+    told = ("long", 30), ("same", 20), ("untold", None), ("odd", [30])
+    for tag, length in told:
         rows = zero_shot_rows("epistemic", [40.0, 50.0])
-        told = {"task_length": length} if length else {}
-        write_run(run / f"zero-shot-003-{tag}", rows, **config, **told, tag=tag)
+        lasts = {"task_length": length} if length else {}
+        write_run(run / f"zero-shot-003-{tag}", rows, **config, **lasts, tag=tag)
     text, _ = report_of(tmp_path)
     assert "the return of a trial of 20 steps under" in text
     assert "trials of 10 steps: forward" in text
     assert "A trial has 10 steps on the left and 20 on the right." in text
-    for name, length in (("long", "30"), ("same", "20"), ("untold", "")):
+    for name, length in (("long", "30"), ("same", "20"), ("untold", ""), ("odd", "")):
         assert f"| {name} | epistemic | 3 | {length} | 0 1 |" in text
         assert (f"| epistemic, {name} | epistemic |" in text) == (name != "long")
 
