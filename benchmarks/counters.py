@@ -4,8 +4,9 @@ It profiles this program, which runs the kernel three times, and its pages of nu
 become rows:
 
     export XLA_FLAGS=--xla_gpu_enable_command_buffer=
-    ncu --set full --target-processes application-only --launch-skip 2 -c 1 \
-        -k "regex:(rollout|epoch)_kernel" -o seen python -m benchmarks.counters
+    ncu --set full --clock-control none --target-processes application-only \
+        --launch-skip 2 -c 1 -k "regex:(rollout|epoch)_kernel" -o seen \
+        python -m benchmarks.counters
     ncu --import seen.ncu-rep --page raw --csv > seen.csv
     ncu --import seen.ncu-rep --page source --csv > source.csv
     python -m benchmarks.counters --read seen.csv --source source.csv

@@ -39,7 +39,7 @@ def test_committed_rows_are_those_of_the_committed_pages(tmp_path, capsys):
         seen |= {page, source}
     assert seen == {*tmp_path.iterdir()}
     printed = capsys.readouterr().out
-    assert printed.count("counters on NVIDIA H100 80GB HBM3") == len(COMMITTED)
+    assert printed.count("counters on NVIDIA H200") == len(COMMITTED)
 
 
 def test_the_page_shows_what_the_rows_say():
