@@ -95,21 +95,31 @@ def to_onnx(
     matrix = np.zeros((size, mean.shape[0]), np.float32)
     matrix[: size - goal_size, : mean.shape[0] - goal_size] = read_rows
     matrix[size - goal_size :, mean.shape[0] - goal_size :] = np.eye(goal_size)
-    offset = np.concatenate([read.offset, np.zeros(goal_size, np.float32)])
-    x = graph.node("Gemm", x, graph.array(matrix), graph.array(offset))
-    # Not part of the product: digits are lost where the mean is large beside the std.
-    x = graph.node("Sub", x, graph.array(mean))
-    x = graph.node("Div", x, graph.array(std))
+    order: Any = slice(None)
+    if read.pairs:
+        offset = np.concatenate([read.offset, np.zeros(goal_size, np.float32)])
+        x = graph.node("Gemm", x, graph.array(matrix), graph.array(offset))
+    else:  # features in another order, as numbers and weights can have them too
+        order = matrix.argmax(axis=1)
+    # Not part of a product: digits are lost where the mean is large beside the std.
+    x = graph.node("Sub", x, graph.array(mean[order]))
+    x = graph.node("Div", x, graph.array(std[order]))
     x = graph.node("Clip", x, graph.array(-CLIP), graph.array(CLIP))
     for i in range(2):
-        x = graph.dense(x, layers[f"Dense_{i}"])
+        x = graph.dense(x, layers[f"Dense_{i}"], slice(None) if i else order)
         norm = layers[f"LayerNorm_{i}"]
         scaled = (graph.array(norm["scale"]), graph.array(norm["bias"]))
         x = graph.node("LayerNormalization", x, *scaled, epsilon=NORM_EPSILON)
         x = graph.node("Elu", x)
-    x = graph.node("Tanh", graph.dense(x, layers["Dense_2"]))
-    x = graph.node("Mul", x, graph.array(box.half_width))
-    graph.node("Add", x, graph.array(box.center), to="action")
+    x = graph.dense(x, layers["Dense_2"])
+    # A node takes a microsecond: a box from -1 to 1 has one.
+    last: list[tuple[str, Any]] = [("Tanh", None)]
+    last += [("Mul", box.half_width)] if np.any(box.half_width != 1.0) else []
+    last += [("Add", box.center)] if np.any(box.center != 0.0) else []
+    for i, (kind, by) in enumerate(last, 1):
+        constants = [] if by is None else [graph.array(by)]
+        to = "action" if i == len(last) else ""
+        x = graph.node(kind, x, *constants, to=to)
     inputs = {"obs": obs_size} | ({"task": goal_size} if goal_size else {})
     return graph.model(inputs, {"action": box.center.shape[0]})
 
@@ -135,10 +145,10 @@ class _Graph:
         self._arrays.append(make(np.asarray(value, dtype), name))
         return name
 
-    def dense(self, x: str, layer: Any) -> str:
-        """Adds a layer of Flax."""
-        weights = (self.array(layer["kernel"]), self.array(layer["bias"]))
-        return self.node("Gemm", x, *weights)
+    def dense(self, x: str, layer: Any, order: Any = slice(None)) -> str:
+        """Adds a layer of Flax, whose inputs may come in another order."""
+        kernel = np.asarray(layer["kernel"])[order]
+        return self.node("Gemm", x, self.array(kernel), self.array(layer["bias"]))
 
     def entries(self, which: list[int]) -> str:
         """Adds columns of the observation."""

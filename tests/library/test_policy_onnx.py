@@ -1,6 +1,7 @@
 """A policy in ONNX acts as it does in JAX."""
 
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -104,6 +105,33 @@ def test_onnxruntime_reads_what_jax_reads_and_no_more():
     content = policies.to_onnx(params, space, obs_size=obs_size, **BOX)
     (found,) = onnxruntime.InferenceSession(content).run(None, {"obs": np.asarray(obs)})
     np.testing.assert_allclose(found, jax.jit(jax.vmap(act))(obs), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "last"),
+    [(-1.0, 1.0, ["Tanh"]), (-2.0, 2.0, ["Tanh", "Mul"]), (0.0, 2.0, ["Tanh", "Add"])],
+)
+def test_a_box_has_no_more_nodes_than_it_needs(low, high, last):
+    """The order of features needs none: each takes as long as a small layer."""
+    onnx, onnxruntime = (pytest.importorskip(name) for name in ("onnx", "onnxruntime"))
+    space, obs_size = SPACES["cheetah"]
+    one = np.ones(2, np.float32)
+    box: Any = {"action_low": low * one, "action_high": high * one}
+    _, params, obs = policy_of(space, obs_size, policies.Goals())
+    content = policies.to_onnx(params, space, obs_size=obs_size, **box)
+    kinds = [node.op_type for node in onnx.load_from_string(content).graph.node]
+    assert kinds[-len(last) - 1 :] == ["Gemm", *last] and kinds.count("Gemm") == 3
+    known = onnxruntime.InferenceSession(content)
+    wide = policies.to_onnx(params, space, obs_size=obs_size, **BOX)
+    given = {"obs": np.asarray(obs)}
+    (found,), (other,) = (
+        session.run(None, given)
+        for session in (known, onnxruntime.InferenceSession(wide))
+    )
+    # Both are the same numbers within their boxes.
+    inside = (other - (HIGH + LOW) / 2) / ((HIGH - LOW) / 2)
+    scaled = inside * (high - low) / 2 + (high + low) / 2
+    np.testing.assert_allclose(found, scaled, atol=1e-5)
 
 
 def test_what_onnx_cannot_hold_is_refused():
