@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator, ScalarFormatter
 
 from benchmarks import costs, workloads
+from benchmarks.rows import appendable
 from experiments.report import style
 
 PEERS = Path(__file__).parent / "results" / "peers.jsonl"
@@ -158,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> Figure:
     """Parses the flags, draws and saves."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILES.jsonl")
-    parser.add_argument("--out", type=Path, default=Path("plan.svg"))
+    parser.add_argument("--out", type=appendable, default=Path("plan.svg"))
     parser.add_argument("--peers", type=Path, default=PEERS, help="rows of peers")
     args = parser.parse_args(argv)
     try:

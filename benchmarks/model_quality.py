@@ -87,6 +87,9 @@ def get_data(args: argparse.Namespace) -> real_data.Split:
     if args.data is not None and args.data.exists():
         with rows.refused(OSError, ValueError):
             return real_data.load(args.data)
+    if args.data is not None:  # which takes minutes to collect
+        with rows.refused(argparse.ArgumentTypeError):
+            rows.appendable(str(args.data))
     data = real_data.collect(*((300, 100) if args.tiny else (10_000, 2_000)))
     if args.data is not None:
         real_data.save(data, args.data)

@@ -459,6 +459,7 @@ def test_what_is_said_wins_over_toy_sizes(monkeypatch, program, flags, said, toy
         (shapes, "--arch volta --precision f32", "arch must be the name of a GPU"),
         (counters, "--read nowhere.csv", "No such file or directory: 'nowhere.csv'"),
         (model_quality, "--ours --data .", "Is a directory: '.'"),
+        (model_quality, "--ours --data no/data.npz", "there is no folder"),
     ],
 )
 def test_sizes_and_files_that_cannot_be_end_with_one_line(

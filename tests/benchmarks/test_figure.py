@@ -172,6 +172,10 @@ def test_bad_usage(tmp_path, capsys):
             figure.main([str(path), "--out", str(tmp_path / "plan.svg")])
         assert caught.value.code == 2
         assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit) as caught:
+        figure.main([str(empty), "--out", str(tmp_path / "none" / "plan.svg")])
+    assert caught.value.code == 2
+    assert "argument --out: there is no folder" in capsys.readouterr().err
 
 
 def test_peers_say_what_was_measured():
