@@ -136,10 +136,9 @@ def policy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     size = 8 if args.tiny else policies.DistillConfig().hidden_size
     found: dict[str, float] = {}
     calls = policy_calls(size)
-    of_onnx = {name: calls.pop(name) for name in ("onnx", "bound")}
-    for group in (of_onnx, calls):
-        turns = timing.in_turn(*group.values(), repeats=args.repeats)
-        for name, seconds in zip(group, zip(*turns, strict=True), strict=True):
+    for names in (("onnx", "bound"), ("jax",)):
+        turns = timing.in_turn(*(calls[x] for x in names), repeats=args.repeats)
+        for name, seconds in zip(names, zip(*turns, strict=True), strict=True):
             times = timing.summary(seconds, 0.0)
             found |= {
                 f"{name}_us": 1e3 * times.median_ms,

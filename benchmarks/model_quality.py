@@ -84,12 +84,11 @@ def sizes(args: argparse.Namespace, data: real_data.Split) -> dict[str, Any]:
 
 def get_data(args: argparse.Namespace) -> real_data.Split:
     """Reads the data, or collects it and writes it for the next time."""
-    if args.data is not None and args.data.exists():
-        with rows.refused(OSError, ValueError):
-            return real_data.load(args.data)
-    if args.data is not None:  # which takes minutes to collect
-        with rows.refused(argparse.ArgumentTypeError):
-            rows.appendable(str(args.data))
+    if args.data is not None:
+        with rows.refused(OSError, ValueError, argparse.ArgumentTypeError):
+            if args.data.exists():
+                return real_data.load(args.data)
+            rows.appendable(str(args.data))  # before it is collected, for minutes
     data = real_data.collect(*((300, 100) if args.tiny else (10_000, 2_000)))
     if args.data is not None:
         real_data.save(data, args.data)

@@ -99,33 +99,32 @@ def to_onnx(
     matrix = np.zeros((size, mean.shape[0]), np.float32)
     matrix[: size - goal_size, : mean.shape[0] - goal_size] = read_rows
     matrix[size - goal_size :, mean.shape[0] - goal_size :] = np.eye(goal_size)
-    order: Any = slice(None)
     if read.pairs:
         offset = np.concatenate([read.offset, np.zeros(goal_size, np.float32)])
         x = graph.node("Gemm", x, graph.array(matrix), graph.array(offset))
-    else:  # features in another order, as numbers and weights can have them too
-        order = matrix.argmax(axis=1)
+    else:  # the features, but in another order, which means and weights take over
+        order, layer = matrix.argmax(axis=1), layers["Dense_0"]
+        mean, std = mean[order], std[order]
+        kernel = np.asarray(layer["kernel"])[order]
+        layers = {**layers, "Dense_0": {**layer, "kernel": kernel}}
     # Not part of a product: digits are lost where the mean is large beside the std.
-    x = graph.node("Sub", x, graph.array(mean[order]))
-    x = graph.node("Div", x, graph.array(std[order]))
+    x = graph.node("Sub", x, graph.array(mean))
+    x = graph.node("Div", x, graph.array(std))
     x = graph.node("Clip", x, graph.array(-CLIP), graph.array(CLIP))
     for i in range(2):
-        x = graph.dense(x, layers[f"Dense_{i}"], slice(None) if i else order)
+        x = graph.dense(x, layers[f"Dense_{i}"])
         norm = layers[f"LayerNorm_{i}"]
         scaled = (graph.array(norm["scale"]), graph.array(norm["bias"]))
         x = graph.node("LayerNormalization", x, *scaled, epsilon=NORM_EPSILON)
         x = graph.node("Elu", x)
-    x = graph.dense(x, layers["Dense_2"])
-    # A node takes a microsecond: a box from -1 to 1 has one.
-    last: list[tuple[str, Any]] = [("Tanh", None)]
-    last += [("Mul", box.half_width)] if np.any(box.half_width != 1.0) else []
-    last += [("Add", box.center)] if np.any(box.center != 0.0) else []
-    for i, (kind, by) in enumerate(last, 1):
-        constants = [] if by is None else [graph.array(by)]
-        to = "action" if i == len(last) else ""
-        x = graph.node(kind, x, *constants, to=to)
+    x = graph.node("Tanh", graph.dense(x, layers["Dense_2"]))
+    # Each node takes a microsecond; a box from -1 to 1 needs none of these.
+    if np.any(box.half_width != 1.0):
+        x = graph.node("Mul", x, graph.array(box.half_width))
+    if np.any(box.center != 0.0):
+        graph.node("Add", x, graph.array(box.center))
     inputs = {"obs": obs_size} | ({"task": goal_size} if goal_size else {})
-    return graph.model(inputs, {"action": box.center.shape[0]})
+    return graph.model(inputs, "action", box.center.shape[0])
 
 
 class _Graph:
@@ -136,9 +135,9 @@ class _Graph:
         self._nodes: list[Any] = []
         self._arrays: list[Any] = []
 
-    def node(self, kind: str, *inputs: str, to: str = "", **options: Any) -> str:
+    def node(self, kind: str, *inputs: str, **options: Any) -> str:
         """Adds a node and returns the name of its output."""
-        name = to or f"x{len(self._nodes)}"
+        name = f"x{len(self._nodes)}"
         make = self._onnx.helper.make_node
         self._nodes.append(make(kind, inputs, [name], **options))
         return name
@@ -149,17 +148,24 @@ class _Graph:
         self._arrays.append(make(np.asarray(value, dtype), name))
         return name
 
-    def dense(self, x: str, layer: Any, order: Any = slice(None)) -> str:
-        """Adds a layer of Flax, whose inputs may come in another order."""
-        kernel = np.asarray(layer["kernel"])[order]
-        return self.node("Gemm", x, self.array(kernel), self.array(layer["bias"]))
+    def dense(self, x: str, layer: Any) -> str:
+        """Adds a layer of Flax."""
+        weights = (self.array(layer["kernel"]), self.array(layer["bias"]))
+        return self.node("Gemm", x, *weights)
 
     def entries(self, which: list[int]) -> str:
         """Adds columns of the observation."""
         return self.node("Gather", "obs", self.array(which, np.int64), axis=1)
 
-    def model(self, inputs: dict[str, int], outputs: dict[str, int]) -> bytes:
-        """Returns all of it as a file has it, rows of any number."""
+    def model(self, inputs: dict[str, int], output: str, size: int) -> bytes:
+        """Returns all of it as a file has it, rows of any number.
+
+        Args:
+          inputs: how many entries each has.
+          output: what the last node's is named.
+          size: its entries.
+        """
+        self._nodes[-1].output[0] = output
         helper, float32 = self._onnx.helper, self._onnx.TensorProto.FLOAT
 
         def rows(sizes: dict[str, int]) -> list[Any]:
@@ -167,7 +173,7 @@ class _Graph:
             return [make(name, float32, ["N", size]) for name, size in sizes.items()]
 
         graph = helper.make_graph(
-            self._nodes, "policy", rows(inputs), rows(outputs), self._arrays
+            self._nodes, "policy", rows(inputs), rows({output: size}), self._arrays
         )
         opset = helper.make_opsetid("", _OPSET)
         # The oldest format that has this opset, so that old runtimes read it.
