@@ -135,9 +135,9 @@ def policy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yields one row of a policy of HalfCheetah's tasks, at the width of its config."""
     size = 8 if args.tiny else policies.DistillConfig().hidden_size
     found: dict[str, float] = {}
-    calls = policy_calls(size)
+    steps = policy_calls(size)
     for names in (("onnx", "bound"), ("jax",)):
-        turns = timing.in_turn(*(calls[x] for x in names), repeats=args.repeats)
+        turns = timing.in_turn(*(steps[x] for x in names), repeats=args.repeats)
         for name, seconds in zip(names, zip(*turns, strict=True), strict=True):
             times = timing.summary(seconds, 0.0)
             found |= {
